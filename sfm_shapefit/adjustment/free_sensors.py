@@ -47,7 +47,7 @@ def judge_sensors(
         sigmas = estimate_covariances(adjusted, options).sensor_sigmas
     except UnsolvableError as error:
         raise InputError(_OPEN_SENSOR.format(camera="one of the sensors")) from error
-    longest = float(np.linalg.norm(adjusted.rig.translations, axis=1).max())
+    longest = float(np.linalg.norm(adjusted.rig.translations, axis=1).max()) or 1.0  # all held at one center
     limits = np.repeat([METRIC_SIGMA * longest, _LARGEST_TURN_RAD], 3) / _SHARED_NOISE
     off = np.nan_to_num((sigmas / limits).max(axis=1), nan=np.inf)
     if off.max() > 1.0:

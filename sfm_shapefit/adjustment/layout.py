@@ -209,6 +209,8 @@ def _nodes(
     active = np.arange(SLOTS) < size_of_node[:, None]
     if scale_sensor >= 0:
         active[node_of_sensor[scale_sensor], 2] = False
+    if not problem.rig.translations.any():  # sensors that share one center only turn
+        active[node_of_sensor, :3] = False
     return node_of_frame, node_of_lens, node_of_sensor, active, lens_slots
 
 

@@ -109,7 +109,12 @@ def compose(outer: Similarity, inner: Similarity) -> Similarity:
 
 
 def fit_similarity(
-    source: FloatArray, target: FloatArray, weights: FloatArray | None = None, *, rotate: bool = True
+    source: FloatArray,
+    target: FloatArray,
+    weights: FloatArray | None = None,
+    *,
+    rotate: bool = True,
+    resize: bool = True,
 ) -> Similarity:
     """Return the similarity that maps `source` onto `target` with least weighted squares.
 
@@ -120,6 +125,7 @@ def fit_similarity(
         source, target: (n, d) corresponding points.
         weights: (n,) non-negative weights, not all 0; equal if None.
         rotate: False keeps the axes and fits scale and translation only.
+        resize: False keeps the scale.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI
     1991.
@@ -130,7 +136,7 @@ def fit_similarity(
     spread = float(w @ np.sum(x * x, axis=1))
     cross = (w[:, None] * y).T @ x
     rotation = nearest_rotations(cross) if rotate else np.eye(source.shape[1])
-    scale = max(0.0, float(np.sum(rotation * cross)) / spread) if spread > 0.0 else 1.0
+    scale = max(0.0, float(np.sum(rotation * cross)) / spread) if spread > 0.0 and resize else 1.0
     return Similarity(
         scale=scale, rotation=rotation, translation=target_mean - scale * rotation @ source_mean
     )
@@ -154,7 +160,7 @@ def distances_in_spreads(points: FloatArray, reference: FloatArray) -> FloatArra
 
 
 def fit_similarity_l1(
-    source: FloatArray, target: FloatArray, *, rotate: bool = True, cap: float = np.inf
+    source: FloatArray, target: FloatArray, *, rotate: bool = True, resize: bool = True, cap: float = np.inf
 ) -> Similarity:
     """Return the similarity that minimizes the sum of unsquared distances min(distance, cap).
 
@@ -169,6 +175,7 @@ def fit_similarity_l1(
     Args:
         source, target: (n, d) corresponding points, n >= 1.
         rotate: False keeps the axes and fits scale and translation only.
+        resize: False keeps the scale.
         cap: positive distance, in the target's units, beyond which a point counts as lost.
     """
     floor = 1e-9 * (median_spread(target) or 1.0)
@@ -188,19 +195,21 @@ def fit_similarity_l1(
             weights = np.where(apart < cap, floor / np.maximum(apart, floor), 0.0)
             if not weights.any():
                 break
-            candidate = fit_similarity(source, target, weights, rotate=rotate)
+            candidate = fit_similarity(source, target, weights, rotate=rotate, resize=resize)
             apart_then = distances(candidate)
             if total(apart_then) >= total(apart) * (1.0 - 1e-12):
                 break
             best, apart = candidate, apart_then
         return best
 
-    plain = fit_similarity(source, target, rotate=rotate)
-    sampled = sorted(fits_of_few_points(source, target, rotate=rotate), key=cost)
+    plain = fit_similarity(source, target, rotate=rotate, resize=resize)
+    sampled = sorted(fits_of_few_points(source, target, rotate=rotate, resize=resize), key=cost)
     return min((reweigh(start) for start in [plain, *sampled[:_NUM_REFINED_SAMPLES]]), key=cost)
 
 
-def fits_of_few_points(source: FloatArray, target: FloatArray, *, rotate: bool) -> list[Similarity]:
+def fits_of_few_points(
+    source: FloatArray, target: FloatArray, *, rotate: bool, resize: bool = True
+) -> list[Similarity]:
     """Return similarities that each fit as few points as determine one, drawn with a fixed seed."""
     size = min(len(source), source.shape[1] if rotate else 2)
     rng = np.random.default_rng(0)
@@ -214,6 +223,7 @@ def fits_of_few_points(source: FloatArray, target: FloatArray, *, rotate: bool) 
     rotations = nearest_rotations(crosses) if rotate else eyes
     alike = np.maximum((rotations * crosses).sum(axis=(1, 2)), 0.0)
     scales = np.divide(alike, spreads, out=np.ones_like(spreads), where=spreads > 0.0)
+    scales = scales if resize else np.ones_like(scales)
     moved = ((scales[:, None, None] * rotations) @ source_means[:, :, None])[:, :, 0]
     fits = zip(scales.tolist(), rotations, target_means - moved, strict=True)
     return [Similarity(scale=scale, rotation=turn, translation=shift) for scale, turn, shift in fits]

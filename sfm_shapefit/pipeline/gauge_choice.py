@@ -9,8 +9,10 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.wording import counted_are
 from sfm_shapefit.pipeline.rigs import Rigid
 from sfm_shapefit.placement.gauge import (
+    FEWEST_CHECKED,
     Gauge,
     ScaleKind,
     coincide,
@@ -18,6 +20,7 @@ from sfm_shapefit.placement.gauge import (
     input_gauge,
     metric_gauge,
     moved_gauge,
+    moved_to_priors,
     prior_gauge,
     unit_gauge,
 )
@@ -64,10 +67,11 @@ class GaugeRule(NamedTuple):
     distances: Sequence[KnownDistance] = ()
 
     def choose(self, cameras: IntArray, locations: FloatArray, unit: float | None) -> Gauge:
-        """Return the gauge of cameras that were found.
+        """Return the gauge of cameras that were found, part by part.
 
-        Rigid groups know the scale; else known distances tell it, else priors, else the input. A single fixed
-        camera moves the origin and keeps the axes, so that priors, which turn them, have no part.
+        scale           rigid groups, else known distances, position priors, the input
+        origin          fixed cameras, else position priors, the input
+        axes            the input's; position priors turn them unless a camera is fixed
 
         Args:
             cameras: (k,) those in the output, ascending.
@@ -78,19 +82,21 @@ class GaugeRule(NamedTuple):
         centers, fixed = images.centers[cameras], rigid.fixed[cameras]
         has_centers = not coincide(images.frames.centers)
         if not has_centers:
-            centers = np.where(
-                np.isfinite(centers), 0.0, np.nan
-            )  # where sensors are in their rig says nothing of positions
+            # Where sensors are in their rig says nothing of positions.
+            centers = np.where(np.isfinite(centers), 0.0, np.nan)
+        priors = None if self.priors is None or rigid.fixed.any() else self.priors.of(cameras)
         if unit is not None:
-            return metric_gauge(locations, unit, centers, fixed, has_rigs=images.has_rigs)
-        if self.distances:
+            gauge = metric_gauge(locations, unit, centers, fixed, has_rigs=images.has_rigs)
+        elif self.distances:
             names = [images.names[camera] for camera in cameras.tolist()]
             gauge = gauge_of_distances(names, locations, self.distances)
-        elif self.priors is not None and not rigid.fixed.any():
-            gauge = prior_gauge(locations, self.priors.of(cameras), axes_known=has_centers)
+        elif priors is not None:
+            return prior_gauge(locations, priors, axes_known=has_centers)
         else:
             gauge = unit_gauge(locations) if self.scale == "unit" else input_gauge(locations, centers)
-        if not rigid.fixed.any():
+        if priors is not None and len(priors):
+            return moved_to_priors(gauge, locations, priors, axes_known=has_centers)
+        if not rigid.fixed.any() or unit is not None:
             return gauge
         name = images.names[int(np.argmax(rigid.fixed))]
         if not fixed.any():
@@ -100,7 +106,7 @@ class GaugeRule(NamedTuple):
         return moved_gauge(gauge, locations[fixed][0], centers[fixed][0], name)
 
     def check(self, chosen: Gauge, cameras: IntArray, centers: FloatArray) -> Iterator[str]:
-        """Yield how far the scale is off what is known and did not set it, a sentence each.
+        """Yield what is known and has no part in the gauge, and how well it checks that, a sentence each.
 
         Args:
             chosen: the gauge of the output.
@@ -111,11 +117,20 @@ class GaugeRule(NamedTuple):
         if self.distances and chosen.scale != "distance":
             known = partial(gauge_of_distances, names, centers, self.distances)
             yield say_unused("known distances were", chosen, lambda: known().similarity.scale)
-        if self.priors is not None and chosen.scale != "prior":
-            priors = self.priors.of(cameras)
+        if self.priors is None:
+            return
+        priors = self.priors.of(cameras)
+        if chosen.scale != "prior":
             yield say_unused(
                 "position priors were", chosen, lambda: prior_gauge(centers, priors).similarity.scale
             )
+        if chosen.has_priors and len(priors) < FEWEST_CHECKED:
+            yield (
+                f"{counted_are(len(priors), 'position prior')} too few to check one another: a wrong one "
+                f"would move the model and not show; give {FEWEST_CHECKED} or more"
+            )
+        elif self.rigid.fixed.any():
+            yield "position priors have no part in origin and axes, which are those of the fixed cameras"
 
 
 def say_unused(what: str, chosen: Gauge, find: Callable[[], float]) -> str:

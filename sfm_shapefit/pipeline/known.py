@@ -48,19 +48,21 @@ def read_known(
 
 
 def bring_to_known(
-    seeded: Seeded, known: Known, options: StructureOptions, *, moves: bool
+    seeded: Seeded, known: Known, options: StructureOptions, *, moves: bool, resize: bool
 ) -> tuple[Seeded, tuple[ControlPoint, ...], list[str]]:
     """Return a model in scale and axes of control points, or with z up by gravity, where these are known.
 
     Points that cannot tell scale and axes leave the model as it is, and so do all where the model is not to
-    move: they check its scale then.
+    move; where it may not `resize`, as its scale is known, they move and turn it. They check its scale then.
 
     Returns:
         The model, a row for each control point, and what to warn of.
     """
     rows, warnings = list[ControlPoint](), list[str]()
     if known.control is not None:
-        seeded, rows, warnings = _bring_to_control_points(seeded, known.control, options, moves=moves)
+        seeded, rows, warnings = _bring_to_control_points(
+            seeded, known.control, options, moves=moves, resize=resize
+        )
     if known.gravity is not None:
         seeded, more = _turn_upright(seeded, known.gravity)
         warnings += more
@@ -91,20 +93,24 @@ def _read_gravity(images: Images, file: DatabaseFile | None, asked: str) -> Grav
 
 
 def _bring_to_control_points(
-    seeded: Seeded, known: ControlPoints, options: StructureOptions, *, moves: bool
+    seeded: Seeded, known: ControlPoints, options: StructureOptions, *, moves: bool, resize: bool
 ) -> tuple[Seeded, list[ControlPoint], list[str]]:
     """Return a model in the world of control points, a row for each point, and what to warn of."""
     found = triangulate_control_points(known, look_at_marks(seeded.images, known), options)
-    fit = fit_control_points(known, found.positions)
+    fit = fit_control_points(known, found.positions, resize=resize or not moves)
     warnings = list(control_warnings(known, found, fit, seeded.images.names))
     rows = control_rows(known, found, fit)
     if isinstance(fit, str):
         return seeded, rows, warnings
+    if not (moves and resize):
+        free = fit_control_points(known, found.positions)
+        scale = 1.0 if isinstance(free, str) else free.motion.scale
+        warnings.append(say_unused("control points were", seeded.gauge, lambda: scale))
     if not moves:
-        checks: list[ControlPoint] = [replace(row, use="check") for row in rows]
-        unused = say_unused("control points were", seeded.gauge, lambda: fit.motion.scale)
-        return seeded, checks, [*warnings, unused]
-    return seeded.moved(fit.motion, control_gauge(seeded.gauge, known, fit)), rows, warnings
+        rows = [replace(row, use="check") for row in rows]
+        return seeded, rows, warnings
+    gauge = control_gauge(seeded.gauge, known, fit, resize=resize)
+    return seeded.moved(fit.motion, gauge), rows, warnings
 
 
 def _turn_upright(seeded: Seeded, gravity: Gravity) -> tuple[Seeded, list[str]]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import fit_similarity, median_spread
+from sfm_shapefit.base.geometry import fit_similarity, fit_similarity_l1, median_spread
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
 from sfm_shapefit.facts.options import PlacingOptions
@@ -36,6 +36,7 @@ from sfm_shapefit.facts.warnings import (
 )
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.seed import SeededModel
+from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.doubted import confirm_cameras
 from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
@@ -65,7 +66,7 @@ from sfm_shapefit.pipeline.memory import describe_work, keep_within_memory
 from sfm_shapefit.pipeline.rigs import may_be_checked, place_by_checked, place_cameras
 from sfm_shapefit.pipeline.seed import Seeded, seed_points, select_trusted
 from sfm_shapefit.pipeline.stand import Stand
-from sfm_shapefit.placement.gauge import Gauge, tell_scale
+from sfm_shapefit.placement.gauge import FEWEST_PRIORS, Gauge, coincide, tell_scale
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_fit import PriorFit, compare_with_priors
 from sfm_shapefit.scene.images import Images
@@ -153,8 +154,8 @@ def finish_piece(
             kept, stand = _choose(stand, judged, options.trust.min_trust)
     if (sure & ~seeded.images.is_posed).any():
         seeded = seed_points(stand, kept, options, clock, sure)
-    moves = judged.unit is None and not given.rigid.fixed.any()
-    seeded, control, told = bring_to_known(seeded, given.known, options.structure, moves=moves)
+    may = {"moves": not given.rigid.fixed.any(), "resize": judged.unit is None}
+    seeded, control, told = bring_to_known(seeded, given.known, options.structure, **may)
     intrinsics = stand.intrinsics
     if seeded.adjusted is not None:
         judged = with_uncertainty(judged, before, seeded.adjusted, stand.gauge.similarity.scale)
@@ -170,7 +171,8 @@ def finish_piece(
             judged = judged.loosened(np.isin(judged.cameras, group.cameras))
     with clock("model"):
         keypoints = source.view.keypoints if source.has_database else None
-        seed = SeededModel.of(given.template, images, seeded.points, keypoints)
+        template = _resize_sensors(given, gauge, images)
+        seed = SeededModel.of(template, images, seeded.points, keypoints)
         hand_back_memory()  # freed by the judgement; the files of a model take as much
     turned = None if stand.adjustment is None else turned_deg(before.rotations, source.images.rotations)
     found = LocateResult(
@@ -292,6 +294,16 @@ def _tied_by_priors(stand: Stand, images: Images) -> IntArray | None:
     return rigid_strip(images, np.isin(images.frame_of, frames) & images.is_posed)
 
 
+def _resize_sensors(given: Given, gauge: Gauge, images: Images) -> Template:
+    """Return the template with sensors that are no cameras in the scale of the output, if that is another."""
+    there = images.is_posed & given.images.is_posed
+    before, now = given.images.centers[there], images.centers[there]
+    keeps = gauge.scale in ("input", "rig", "fixed") or not given.template.has_open_sensors
+    if keeps or len(before) < FEWEST_PRIORS or coincide(before):
+        return given.template
+    return given.template.resized(fit_similarity_l1(before, now).scale)
+
+
 def _place_all(stand: Stand, images: Images) -> Images:
     """Return the delivered images, and where they are placed those that were left out."""
     before, now = stand.place().frames.centers, images.frames.centers
@@ -303,7 +315,7 @@ def _place_all(stand: Stand, images: Images) -> Images:
 def _compare_with_priors(stand: Stand, judged: Judged, images: Images, gauge: Gauge) -> PriorFit | None:
     """Return how well position priors fit the delivered images where they set the scale; else None."""
     priors, pairs = stand.given.known.priors, stand.directions
-    if priors is None or gauge.scale != "prior":
+    if priors is None or not gauge.has_priors:
         return None
     directions = pairs.directions if gauge.axes is None else pairs.directions @ gauge.axes.T
     sigmas, own = np.full(images.num_images, np.nan), standard_deviations(judged.covariances)

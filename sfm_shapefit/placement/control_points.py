@@ -11,6 +11,7 @@ fits up to 4 times that; a factor sqrt(1 + 7 / (3 n - 7)) allows for a sigma fro
 `scripts/results/notes.md#control-points`. Three points check nothing.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,10 +22,9 @@ from sfm_shapefit.base.geometry import (
     Similarity,
     compose,
     fit_similarity,
-    median_spread,
     principal_lengths,
 )
-from sfm_shapefit.placement.gauge import Gauge, fit_to_priors
+from sfm_shapefit.placement.gauge import Free, Gauge, fit_to_priors
 from sfm_shapefit.scene.given import (
     FEWEST_CONTROL_POINTS,
     ControlPoints,
@@ -38,7 +38,6 @@ from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import PointLimits, triangulate_tracks
 
 _MARK_ERRORS = 4.0  # keypoint errors; marks are set by hand, in a model that may be bent
-_PARAMETERS = 7  # parameters of a similarity: scale 1, turn 3, shift 3
 _FITTING_SIGMAS = 4.0  # standard deviations; chosen on scripts/results/notes.md#control-points
 _MOST_ROUNDS = 20  # rounds, a bound; who fits settles in fewer
 _FLAT = 5.0  # standard deviations; a smaller spread across a line leaves the turn about the line open
@@ -109,23 +108,29 @@ def triangulate_control_points(
     return TriangulatedControl(positions, errors, agreeing)
 
 
-def fit_control_points(control: ControlPoints, positions: FloatArray) -> ControlFit | str:
-    """Return the similarity that maps found positions (k, 3) onto the known ones, or why there is none."""
+def fit_control_points(
+    control: ControlPoints, positions: FloatArray, *, resize: bool = True
+) -> ControlFit | str:
+    """Return the similarity that maps found positions (k, 3) onto the known ones, or why there is none.
+
+    It keeps the scale if it may not `resize`.
+    """
     there: BoolArray = np.asarray(np.isfinite(positions).all(axis=1))
     rows = np.flatnonzero(there & ~control.is_check)
     source, target = positions[rows], control.positions[rows]
     reason = why_too_few(target, "can be triangulated")
     if reason:
         return reason
-    fits: BoolArray = _start(source, target)
+    free = Free(resize=resize)
+    fits: BoolArray = _start(source, target, free)
     for _ in range(_MOST_ROUNDS):
-        motion = fit_similarity(source, target, fits.astype(np.float64))
+        motion = fit_similarity(source, target, fits.astype(np.float64), resize=resize)
         apart: FloatArray = np.asarray(np.linalg.norm(motion.apply(source) - target, axis=1))
-        freedom = 3.0 * float(fits.sum()) - _PARAMETERS
+        freedom = 3.0 * float(fits.sum()) - free.unknowns
         sigma = float(np.sqrt(np.sum(apart[fits] ** 2) / freedom))
         nearest = np.argsort(apart, kind="stable")[:FEWEST_CONTROL_POINTS]
-        spread = np.sqrt(1.0 + np.where(fits, 0.0, _leverages(target, fits)))
-        limit = _FITTING_SIGMAS * np.sqrt(1.0 + _PARAMETERS / freedom) * sigma
+        spread = np.sqrt(1.0 + np.where(fits, 0.0, _leverages(target, fits, free)))
+        limit = _FITTING_SIGMAS * np.sqrt(1.0 + free.unknowns / freedom) * sigma
         again = np.array(apart <= limit * spread, dtype=np.bool_)
         again[nearest] = True
         if (again == fits).all():
@@ -145,8 +150,8 @@ def fit_control_points(control: ControlPoints, positions: FloatArray) -> Control
     return ControlFit(motion, fitting, sigma, residuals, sigma / size)
 
 
-def control_gauge(before: Gauge, control: ControlPoints, fit: ControlFit) -> Gauge:
-    """Return the gauge of control points, for a model that stands in another one.
+def control_gauge(before: Gauge, control: ControlPoints, fit: ControlFit, *, resize: bool) -> Gauge:
+    """Return the gauge of control points, for a model that stands in another one, whose scale may `resize`.
 
     y = A (s x + b) becomes c R y + t = R A (c s x + c b + (R A)^T t).
     """
@@ -156,24 +161,30 @@ def control_gauge(before: Gauge, control: ControlPoints, fit: ControlFit) -> Gau
     total = Similarity(scale=motion.scale, rotation=np.eye(3), translation=shift)
     used = int(np.sum(~control.is_check & np.isfinite(fit.residuals[:, 0])))
     told = f"the scale is known to {100.0 * fit.scale_sigma:.2g} %"
+    agree = f"{control.statement}; {int(fit.fitting.sum())} of {used} agree, to {fit.sigma:.3g} per axis"
+    gauge = replace(
+        before,
+        similarity=compose(total, before.similarity),
+        axes=axes,
+        statement=f"{before.scale_statement}; control points: {agree}; origin and axes: theirs",
+        datum=control.datum,
+        has_priors=False,
+    )
+    if not resize:
+        return gauge
     warning = ""
     if fit.scale_sigma > METRIC_SIGMA:
         warning = f"{told} only, so it is not metric: the control points contradict one another, or the model"
-    return Gauge(
-        similarity=compose(total, before.similarity),
+    return replace(
+        gauge,
         scale="control points",
-        axes=axes,
-        statement=(
-            f"control points: {control.statement}; {int(fit.fitting.sum())} of {used} agree, to "
-            f"{fit.sigma:.3g} per axis; origin and axes: theirs; {told}"
-        ),
+        statement=f"control points: {agree}; origin and axes: theirs; {told}",
         warning=warning,
         scale_sigma=fit.scale_sigma,
-        datum=control.datum,
     )
 
 
-def _start(source: FloatArray, target: FloatArray) -> BoolArray:
+def _start(source: FloatArray, target: FloatArray, free: Free) -> BoolArray:
     """Return which points fit at first: all of three, else those of the robust fit if they are enough."""
     everyone = np.ones(len(source), dtype=np.bool_)
     if len(source) <= FEWEST_CONTROL_POINTS:
@@ -182,20 +193,21 @@ def _start(source: FloatArray, target: FloatArray) -> BoolArray:
     priors = PositionPriors(
         known=KnownPositions.measured(np.arange(len(target)), target, unknown), statement=""
     )
-    fits = fit_to_priors(source, priors, median_spread(target), rotate=True)[1] >= 0.5
+    fits = fit_to_priors(source, priors, free, FEWEST_CONTROL_POINTS + 1).weights >= 0.5
     return fits if not why_too_few(target[fits], "") else everyone
 
 
-def _leverages(points: FloatArray, fits: BoolArray) -> FloatArray:
+def _leverages(points: FloatArray, fits: BoolArray, free: Free) -> FloatArray:
     """Return the variance per axis that a fit to some points (k, 3) predicts for all, in their variances.
 
     J of a shift, a turn and a scale about their mean is [I, -[x]_x, x].
     """
     x = points - points[fits].mean(axis=0)
     x /= np.linalg.norm(x[fits])
-    jacobians = np.zeros((len(points), 3, _PARAMETERS))
+    jacobians = np.zeros((len(points), 3, free.unknowns))
     jacobians[:, :, :3] = np.eye(3)
     jacobians[:, :, 3:6] = np.cross(np.eye(3), x[:, None, :])
-    jacobians[:, :, 6] = x
+    if free.resize:
+        jacobians[:, :, 6] = x
     normal = np.einsum("kab,kac->bc", jacobians[fits], jacobians[fits])
     return np.asarray(np.einsum("kab,kab->k", jacobians @ np.linalg.pinv(normal), jacobians)) / 3.0

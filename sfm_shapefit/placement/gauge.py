@@ -7,7 +7,7 @@ whole model onto their axes.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -34,10 +34,27 @@ _COINCIDENT = 1e-9  # share of the distance from the origin; a smaller spread of
 ScaleKind = Literal["fixed", "rig", "control points", "distance", "prior", "input", "unit"]
 """What can set a scale, by precedence."""
 FEWEST_PRIORS = 2  # positions; with fewer there is no scale
+FEWEST_CHECKED = 5
+"""Positions; fewer, less the seven unknowns of a similarity, do not tell which of them is wrong."""
 _PRIORS_FOR_AXES = 3  # positions; two leave the turn about their line open
 _FLAT = 5.0  # residuals; a smaller spread across a line leaves the turn about the line open
 _KERNEL_WIDTH = 3.0  # standard deviations at which a prior has half of its weight; lost ones hardly count
 _REWEIGHTINGS = 20  # steps, a bound; weights settle in fewer
+
+
+class Free(NamedTuple):
+    """What of a similarity a fit may choose, beside the shift."""
+
+    rotate: bool = True
+    resize: bool = True
+
+    @property
+    def unknowns(self) -> int:
+        """How many numbers that are."""
+        return 3 + 3 * self.rotate + self.resize
+
+
+ALL_FREE = Free()
 
 
 class UselessPriorsError(InputError):
@@ -54,6 +71,8 @@ class Gauge:
     """What set the scale."""
     statement: str
     """What scale, origin and axes the output has, for the report."""
+    scale_statement: str = ""
+    """What the scale alone is, where it is known and origin and axes may still be those of something else."""
     axes: FloatArray | None = None
     """(3, 3) rotation from the input's axes to the output's, about the origin, applied to the whole model
     after `similarity`; None where the axes are the input's."""
@@ -63,6 +82,8 @@ class Gauge:
     """Relative standard deviation of the scale, where that is measured and its error known."""
     datum: Datum | None = None
     """Where the output's origin is on Earth, if priors on Earth set it."""
+    has_priors: bool = False
+    """Whether position priors set the origin and, as far as they tell them, the axes."""
 
     def apply(self, locations: FloatArray) -> FloatArray:
         """Map the solver's locations (n, 3) to the output's units and axes."""
@@ -117,11 +138,12 @@ def metric_gauge(
         shift, origin = np.median(shifts[known], axis=0), "origin of the input's centers"
     else:
         shift, origin = -scale * locations.mean(axis=0), "centroid at the origin"
-    statement = f"fixed: scale and {origin}"
-    if has_rigs:
-        statement = f"rig: the unit of the sensors' offsets in their rigs; {origin}"
-    name: Literal["rig", "fixed"] = "rig" if has_rigs else "fixed"
-    return Gauge(similarity=_keep_axes(scale, shift), scale=name, statement=statement)
+    similarity = _keep_axes(scale, shift)
+    if not has_rigs:
+        return Gauge(similarity=similarity, scale="fixed", statement=f"fixed: scale and {origin}")
+    of_rigs = "rig: the unit of the sensors' offsets in their rigs"
+    statement = f"{of_rigs}; {origin}"
+    return Gauge(similarity=similarity, scale="rig", statement=statement, scale_statement=of_rigs)
 
 
 def moved_gauge(gauge: Gauge, location: FloatArray, center: FloatArray, name: str) -> Gauge:
@@ -177,6 +199,7 @@ def distance_gauge(
         similarity=similarity,
         scale="distance",
         statement=statement,
+        scale_statement=f"distance: {said}",
         scale_sigma=sigma if len(distances) > 1 else None,
         warning=f"the known distances contradict one another: {said}" if sigma > METRIC_SIGMA else "",
     )
@@ -200,8 +223,8 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bo
 
     From the L1 fit, reweighted least squares with the priors' standard deviations (or one level for all,
     where these are too small or not known) and the weight 1 / (1 + (chi / 3)^4): a minority of wrong priors
-    has no part in it. UselessPriorsError if fewer than two cameras have one, or the priors coincide or
-    contradict the answer.
+    has no part in it. Fewer than five, which cannot tell who is wrong, weigh alike. UselessPriorsError if
+    fewer than two cameras have one, or the priors coincide or contradict the answer.
 
     Args:
         locations: (n, 3) the solver's answer.
@@ -214,30 +237,81 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bo
             f"{len(priors)} of the placed cameras have a position prior, and a scale needs two; "
             "give priors of more cameras, or choose another scale"
         )
-    source, target = locations[priors.known.indices], priors.known.positions
-    size = median_spread(target)
-    if size <= _COINCIDENT * max(1.0, float(np.abs(target).max())):
+    target = priors.known.positions
+    if median_spread(target) <= _COINCIDENT * max(1.0, float(np.abs(target).max())):
         raise UselessPriorsError("the position priors coincide, so they set no scale; choose another scale")
-    turns = len(source) >= _PRIORS_FOR_AXES
-    similarity, weights, level = fit_to_priors(source, priors, size, rotate=turns)
-    across = np.sqrt(np.linalg.svd(_center(target, weights), compute_uv=False)[1] ** 2 / weights.sum())
-    if turns and across <= max(_FLAT * level, _COINCIDENT * size):  # exact priors have no level
-        turns = False
-        similarity, weights, level = fit_to_priors(source, priors, size, rotate=False)
-    if not turns and not axes_known:
-        similarity, weights, level = fit_to_priors(source, priors, size, rotate=True)
-    if similarity.scale <= 0.0:
+    fit = _fit_turning(locations[priors.known.indices], priors, Free(), axes_known=axes_known)
+    if fit.motion.scale <= 0.0:
         raise UselessPriorsError(
             "the position priors contradict the cameras that were found; check that names and axes are right"
         )
-    reading = better_reading(source, priors) if level > _DOUBTFUL * size else ""
     return Gauge(
-        similarity=_keep_axes(similarity.scale, similarity.rotation.T @ similarity.translation),
+        similarity=_keep_axes(fit.motion.scale, fit.motion.rotation.T @ fit.motion.translation),
         scale="prior",
-        axes=similarity.rotation if turns or not axes_known else None,
-        statement=_prior_statement(priors, similarity, weights, level, turns=turns or not axes_known),
-        warning=_prior_warning(level / size, reading, turns=turns, axes_known=axes_known),
-        datum=priors.datum if turns else None,
+        statement=f"prior: {priors.statement}; {fit.statement}",
+        **_by_priors(fit, priors),
+    )
+
+
+def moved_to_priors(
+    gauge: Gauge, locations: FloatArray, priors: PositionPriors, *, axes_known: bool = True
+) -> Gauge:
+    """Return a gauge of known scale, moved and turned onto position priors, of one camera at least.
+
+    Arguments as of `prior_gauge`.
+    """
+    scaled = gauge.similarity.scale * locations[priors.known.indices]
+    fit = _fit_turning(scaled, priors, Free(resize=False), axes_known=axes_known)
+    return replace(
+        gauge,
+        similarity=_keep_axes(gauge.similarity.scale, fit.motion.rotation.T @ fit.motion.translation),
+        statement=f"{gauge.scale_statement}; {priors.statement}: {fit.statement}",
+        **_by_priors(fit, priors, gauge.warning),
+    )
+
+
+def _by_priors(fit: "_TurnedFit", priors: PositionPriors, warning: str = "") -> dict[str, Any]:
+    """Return what a fit to position priors makes of a gauge beside its scale."""
+    return {
+        "axes": fit.motion.rotation if fit.turns else None,
+        "warning": "; ".join(filter(None, [warning, fit.warning])),
+        "datum": priors.datum if fit.tells_axes else None,
+        "has_priors": True,
+    }
+
+
+class _TurnedFit(NamedTuple):
+    """A fit to position priors whose axes are theirs, as far as they tell these."""
+
+    motion: Similarity
+    tells_axes: bool
+    turns: bool
+    """Whether it turns at all, if only onto a line."""
+    statement: str
+    warning: str
+
+
+def _fit_turning(source: FloatArray, priors: PositionPriors, free: Free, *, axes_known: bool) -> _TurnedFit:
+    """Return the fit of the cameras with priors, at `source` (k, 3), which turns if priors tell the axes."""
+    target = priors.known.positions
+    size = median_spread(target)
+    is_point = size <= _COINCIDENT * max(1.0, float(np.abs(target).max()))
+    tells = len(source) >= _PRIORS_FOR_AXES and not is_point
+    fit = fit_to_priors(source, priors, free._replace(rotate=tells))
+    values = np.linalg.svd(_center(target, fit.weights), compute_uv=False)
+    across = 0.0 if len(values) < 2 else float(values[1]) / np.sqrt(fit.weights.sum())
+    on_line = tells and across <= max(_FLAT * fit.level, _COINCIDENT * size)  # exact priors have no level
+    tells = tells and not on_line
+    turns = tells or not (axes_known or is_point)
+    if on_line or turns != tells:
+        fit = fit_to_priors(source, priors, free._replace(rotate=turns))
+    reading = better_reading(source, priors) if fit.level > _DOUBTFUL * size > 0.0 else ""
+    return _TurnedFit(
+        fit.motion,
+        tells,
+        turns,
+        _prior_statement(fit, turns=turns),
+        _prior_warning(fit.level, size, reading, on_line=on_line, turns=turns, tells_axes=tells),
     )
 
 
@@ -269,26 +343,49 @@ def _keep_axes(scale: float, shift: FloatArray) -> Similarity:
     return Similarity(scale=scale, rotation=np.eye(3), translation=shift)
 
 
-def fit_to_priors(
-    source: FloatArray, priors: PositionPriors, size: float, *, rotate: bool
-) -> tuple[Similarity, FloatArray, float]:
-    """Return the similarity, the weight of each prior in [0, 1], and the level of their residuals.
+class PriorMotion(NamedTuple):
+    """A similarity that maps cameras onto their position priors."""
 
-    `source` (k, 3) are the locations of the cameras with priors, `size` is the priors' spread; with `rotate`
-    the axes are fitted too.
-    """
-    target = priors.known.positions
-    similarity = fit_similarity_l1(source, target, rotate=rotate, cap=_CAP_OF_SIZE * size)
+    motion: Similarity
+    weights: FloatArray
+    """(k,) weight of each prior in [0, 1]."""
+    level: float
+    """Standard deviation of their residuals per axis."""
+
+
+def fit_to_priors(
+    source: FloatArray, priors: PositionPriors, free: Free = ALL_FREE, fewest: int = FEWEST_CHECKED
+) -> PriorMotion:
+    """Return the robust fit of cameras at `source` (k, 3) to their priors; plain for less than `fewest`."""
+    target, robust = priors.known.positions, len(source) >= fewest
+    size = median_spread(target)
+    if robust:
+        cap = _CAP_OF_SIZE * size or np.inf
+        motion = fit_similarity_l1(source, target, rotate=free.rotate, resize=free.resize, cap=cap)
+    else:
+        motion = fit_similarity(source, target, rotate=free.rotate, resize=free.resize)
     sigmas = np.nan_to_num(priors.known.sigmas(), nan=0.0)
     weights = np.ones(len(source))
     level = 0.0
     for _ in range(_REWEIGHTINGS):
-        residuals = np.linalg.norm(similarity.apply(source) - target, axis=1)
-        level = float(np.median(residuals)) / MEDIAN_NORMAL_LENGTH
-        spread = np.maximum(np.maximum(sigmas, level), 1e-12 * size)
-        weights = 1.0 / (1.0 + (residuals / (_KERNEL_WIDTH * spread)) ** 4)
-        similarity = fit_similarity(source, target, weights / spread**2, rotate=rotate)
-    return similarity, weights, level
+        residuals = np.linalg.norm(motion.apply(source) - target, axis=1)
+        level = residual_level(residuals, free.unknowns, robust=robust)
+        spread = np.maximum(np.maximum(sigmas, level), 1e-12 * size or 1.0)
+        if robust:
+            weights = 1.0 / (1.0 + (residuals / (_KERNEL_WIDTH * spread)) ** 4)
+        motion = fit_similarity(source, target, weights / spread**2, rotate=free.rotate, resize=free.resize)
+    return PriorMotion(motion, weights, level)
+
+
+def residual_level(residuals: FloatArray, num_unknowns: int, *, robust: bool) -> float:
+    """Return the standard deviation per axis of residuals (k,) in space that so many unknowns have shrunk.
+
+    It comes from their median if it is to be robust, which a few residuals are too few for.
+    """
+    left = max(3 * len(residuals) - num_unknowns, 1)
+    if robust:
+        return float(np.median(residuals)) / MEDIAN_NORMAL_LENGTH * float(np.sqrt(3 * len(residuals) / left))
+    return float(np.sqrt(np.sum(residuals**2) / left))
 
 
 def _center(points: FloatArray, weights: FloatArray) -> FloatArray:
@@ -297,35 +394,29 @@ def _center(points: FloatArray, weights: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(weights)[:, None] * (points - mean))
 
 
-def _prior_statement(
-    priors: PositionPriors, similarity: Similarity, weights: FloatArray, level: float, *, turns: bool
-) -> str:
-    agreeing = int(np.sum(weights >= 0.5))
+def _prior_statement(fit: PriorMotion, *, turns: bool) -> str:
+    count, agreeing = len(fit.weights), int(np.sum(fit.weights >= 0.5))
     axes = "axes: the input's"
     if turns:
-        axes = f"turned by {float(rotation_angles_deg(similarity.rotation)):.1f} deg onto theirs"
-    return (
-        f"prior: {priors.statement}; {agreeing} of {len(weights)} agree, to {level:.3g} per axis; "
-        f"origin: theirs, {axes}"
-    )
+        axes = f"turned by {float(rotation_angles_deg(fit.motion.rotation)):.1f} deg onto theirs"
+    agree = f"{agreeing} of {count} agree" if count >= FEWEST_CHECKED else f"{count} do not check one another"
+    return f"{agree}, to {fit.level:.3g} per axis; origin: theirs, {axes}"
 
 
-def _prior_warning(level: float, reading: str, *, turns: bool, axes_known: bool) -> str:
-    """Return why priors, which are off by `level` of their spread, may not be right; empty if they may."""
-    off = f"the position priors are {level:.0%} of their spread off the answer"
+def _prior_warning(
+    level: float, size: float, reading: str, *, on_line: bool, turns: bool, tells_axes: bool
+) -> str:
+    """Return why priors of a spread `size`, off by `level`, may not be right; empty if they may."""
+    off = f"the position priors are {level / size if size else 0.0:.0%} of their spread off the answer"
     if reading:
         return f"{off}, and scale and axes taken from them no better; {reading}"
-    if level > _ROUGH:
-        rough = "are rough; check them" if level < _MEANINGLESS else "mean nothing: are they of this scene?"
+    if level > _ROUGH * size > 0.0:
+        is_rough = level < _MEANINGLESS * size
+        rough = "are rough; check them" if is_rough else "mean nothing: are they of this scene?"
         return f"{off}, so scale and axes taken from them {rough}"
-    if not turns and not axes_known:
-        return (
-            "the position priors lie on a line or are fewer than three, so the model is turned onto that "
-            "line, and about it by any angle"
-        )
-    if not turns:
-        return (
-            "the position priors lie on a line or are fewer than three, so the axes are kept as the input "
-            "has them; they need not be those of the priors"
-        )
-    return ""
+    if tells_axes:
+        return ""
+    few = "the position priors lie on a line" if on_line else "the position priors are fewer than three"
+    if turns:
+        return f"{few}, so the model is turned onto that line, and about it by any angle"
+    return f"{few}, so the axes are kept as the input has them; they need not be those of the priors"

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.geometry import MEDIAN_NORMAL_LENGTH, angle_between_deg, median_spread, normalized
+from sfm_shapefit.base.geometry import angle_between_deg, median_spread, normalized
+from sfm_shapefit.placement.gauge import ALL_FREE, FEWEST_CHECKED, residual_level
 from sfm_shapefit.scene.given import PositionPriors
 
 _FAR = 5.0  # standard deviations; of 100,000 cameras with normal errors two are farther off by chance
@@ -28,7 +29,8 @@ def compare_with_priors(
 ) -> PriorFit:
     """Return how well priors fit cameras that stand in the priors' axes.
 
-    A prior is off by its own standard deviation, or by the level of all, whichever is larger.
+    A prior is off by its own standard deviation, or by the level of all, whichever is larger. Of five right
+    ones without a standard deviation one is called wrong in 7 of 100 draws, of eight in less than one.
 
     Args:
         centers: (n, 3) of all cameras in the output; NaN for those that are not in it.
@@ -43,7 +45,9 @@ def compare_with_priors(
     positions[rows] = priors.known.positions
     off[rows] = np.linalg.norm(priors.known.off(centers), axis=1)
     there = np.isfinite(off)
-    level = float(np.median(off[there])) / MEDIAN_NORMAL_LENGTH if there.any() else 0.0
+    count, unknowns = max(int(there.sum()), 1), ALL_FREE.unknowns
+    level = residual_level(off[there], unknowns, robust=count >= FEWEST_CHECKED) if there.any() else 0.0
+    level *= (3 * count / max(3 * count - unknowns, 1)) ** 2  # a level of few is not well known itself
     least = max(level, _ROUNDING * median_spread(priors.known.positions))
     errors[rows] = np.fmax(priors.known.sigmas(), least)
     wrong = np.flatnonzero(off > _FAR * np.hypot(errors, np.nan_to_num(sigmas, posinf=np.inf)))

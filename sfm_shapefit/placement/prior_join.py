@@ -56,7 +56,7 @@ def place_by_priors(centers: FloatArray, priors: PositionPriors) -> PlacedByPrio
     if gauge.warning or gauge.axes is None:
         raise UnsolvableError(gauge.warning)
     source, target = centers[priors.known.indices], priors.known.positions
-    best, weights, _ = fit_to_priors(source, priors, median_spread(target), rotate=True)
+    best, weights, _ = fit_to_priors(source, priors)
     every = np.arange(len(target))
     count = min(len(target), _MOST_FITS)
     parts = [fit_similarity(source, target, weights * (every % count != k)) for k in range(count)]

@@ -23,6 +23,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import (
     Alignment,
     Similarity,
+    fit_similarity,
     fit_similarity_l1,
     mean_rotation_l1,
     median_spread,
@@ -51,6 +52,7 @@ AUC_THRESHOLDS_DEG = (0.5, 1.0, 5.0, 10.0)
 RELATIVE_THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
 _WORST = 10  # worst cameras that are named; more would hide the figures above them
 _MIN_COMMON = 3  # centers in common; fewer never determine a similarity
+_FEWEST_CHECKED = 5  # centers; fewer, less the seven unknowns of a similarity, do not tell who is wrong
 # Caps of 0.3 and 0.5 survived every corruption of half of the cameras minus one that was tried; a cap of 1
 # failed on some sets of 7 and 11 cameras.
 _CAP_OF_SPREAD = 0.5
@@ -253,7 +255,7 @@ def evaluate_poses(
     _refuse_coincident("the reference", y)
 
     cap = _CAP_OF_SPREAD * median_spread(y)
-    ref_from_model = fit_similarity_l1(x, y, cap=cap)
+    ref_from_model = _align(x, y)
     aligned = ref_from_model.apply(x)
     errors = np.linalg.norm(aligned - y, axis=1)
     turns = np.swapaxes(theirs.rotations, 1, 2) @ ours.rotations
@@ -298,9 +300,26 @@ def _common_cameras(names: Sequence[str], ref_names: Sequence[str]) -> tuple[Int
         shown = f": {'; '.join(filter(None, [', '.join(examples), ambiguity]))}" if examples else ""
         raise InputError(
             f"the model ({len(names)} cameras) and the reference ({len(ref_names)}) share {len(in_ref)} image"
-            f" names{shown}; at least {_MIN_COMMON} must be equal"
+            f" names{shown}; at least {_MIN_COMMON} must be equal, as an alignment leaves two without errors"
         )
     return places[in_ref], in_ref, ambiguity
+
+
+def _align(x: FloatArray, y: FloatArray) -> Similarity:
+    """Return the robust similarity from x to y (k, 3); of few, which cannot outvote one, the plain one."""
+    if len(x) < _FEWEST_CHECKED:
+        return fit_similarity(x, y)
+    return fit_similarity_l1(x, y, cap=_CAP_OF_SPREAD * median_spread(y))
+
+
+def _say_few(count: int) -> str:
+    """Say how much of the errors of so few cameras an alignment takes up; empty for more."""
+    if count >= _FEWEST_CHECKED:
+        return ""
+    return (
+        f"the alignment of {count} cameras takes up 7 of their {3 * count} coordinates, and with them most "
+        "of the errors: compare more"
+    )
 
 
 def _refuse_coincident(owner: str, centers: FloatArray) -> None:
@@ -354,7 +373,7 @@ def _relative_pose_aucs(
 
 def _warnings(degenerate: bool, close: BoolArray, cap: float, turned_deg: FloatArray) -> tuple[str, ...]:
     """Return the sentences that a reader of the figures must know."""
-    found = []
+    found = [few] if (few := _say_few(len(close))) else []
     if (turn := float(np.median(turned_deg))) > _OTHER_SCENE_DEG:
         found.append(f"rotations differ by {turn:.0f} degrees, median: do both models show the same scene?")
     if degenerate:
@@ -446,12 +465,12 @@ def evaluate_positions(
     x, y = model[1][in_model], reference[1][in_ref]
     _refuse_coincident("the model", x)
     _refuse_coincident("the reference", y)
-    ref_from_model = fit_similarity_l1(x, y, cap=_CAP_OF_SPREAD * median_spread(y))
+    ref_from_model = _align(x, y)
     return PositionEvaluation(
         names=tuple(reference[0][k] for k in in_ref),
         missing=_without(reference[0], in_ref),
         offsets=frozen(x - y) if as_they_stand else None,
         aligned_errors=frozen(np.linalg.norm(ref_from_model.apply(x) - y, axis=1)),
         ref_from_model=ref_from_model,
-        statement=statement,
+        statement="; ".join(filter(None, [statement, _say_few(len(x))])),
     )

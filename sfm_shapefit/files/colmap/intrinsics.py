@@ -23,7 +23,6 @@ import pycolmap
 
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
-from sfm_shapefit.files.colmap.lenses import camera_of
 from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS
 from sfm_shapefit.files.colmap.quiet import quiet_stderr
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile

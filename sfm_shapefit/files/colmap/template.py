@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +41,19 @@ class Template:
         """Names of all images, posed or not."""
         return tuple(name_of(image) for image in self.images)
 
+    @property
+    def has_open_sensors(self) -> bool:
+        """Whether a rig has sensors that are no cameras, such as an IMU, and no camera off its origin."""
+        return any(map(_open_sensors, self.rigs))
+
+    def resized(self, scale: float) -> "Template":
+        """Return the same with these sensors so many times as far from the origins of their rigs."""
+        rigs = deepcopy(self.rigs)
+        for rig in rigs:
+            for sensor, pose in _open_sensors(rig).items():
+                rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(pose.rotation, scale * pose.translation))
+        return replace(self, rigs=rigs)
+
     def build(self) -> pycolmap.Reconstruction:
         """Return a new model without points, its frames where they were."""
         model = pycolmap.Reconstruction()
@@ -66,6 +79,15 @@ class Template:
             if head.pose is not None:
                 model.register_frame(head.id)
         return model
+
+
+def _open_sensors(rig: pycolmap.Rig) -> dict[pycolmap.sensor_t, pycolmap.Rigid3d]:
+    """Return the posed sensors of a rig that are no cameras; none where a camera is off its origin."""
+    posed = {sensor: pose for sensor, pose in rig.non_ref_sensors.items() if pose is not None}
+    cameras = [sensor for sensor in posed if sensor.type == pycolmap.SensorType.CAMERA]
+    if any(posed.pop(sensor).translation.any() for sensor in cameras):
+        return {}
+    return posed
 
 
 def template_of(model: ColmapModel, replaced: BoolArray | None = None) -> Template:
