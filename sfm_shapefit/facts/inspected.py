@@ -35,6 +35,7 @@ class Inspection(Record, Displayed, repr=False):
     rigs: Annotated[str, "How many frames hang together, if the model has rigs."] = (
         "none: every image is a frame of its own"
     )
+    warnings: Annotated[tuple[str, ...], "What was read otherwise than it stands, a sentence each."] = ()
 
     def _headline(self) -> str:
         return f"{self.num_images} images, {self.diagnosis.obstacle or 'which can be placed'}"
@@ -61,5 +62,6 @@ class Inspection(Record, Displayed, repr=False):
             row("solver", f"{plan.solver}: {plan.solver_reason}" if plan else ""),
             row("finish", plan.finish if plan else ""),
             row("will take", self.expected.statement if self.expected else ""),
+            Row("warning", self.warnings),
         ]
         return Telling((), rows, elsewhere="see --json")

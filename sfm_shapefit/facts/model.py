@@ -395,7 +395,9 @@ class CheckedFacts(FactsOfModel):
         judged = [pair.verdict for pair in pairs if pair.direction]  # the others say nothing of positions
         lines = self.told_lines((judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
-        return Telling(lines, [Row("weak", weak), second], elsewhere="see the report", step=self.next_step)
+        others = [warning for warning in self.warnings if warning not in self.evidence.statements]
+        rows = [Row("weak", weak), second, Row("warning", others)]
+        return Telling(lines, rows, elsewhere="see the report", step=self.next_step)
 
 
 class JoinedFacts(CheckedFacts):

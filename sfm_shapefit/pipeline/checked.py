@@ -121,7 +121,7 @@ def check_source(
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, cameras, pairs, quality)
     facts |= {"verdict": verdict, "residual_level_deg": level_deg, "timings_s": clock.seconds}
-    facts |= {"evidence": told, "warnings": told.statements}
+    facts |= {"evidence": told, "warnings": [*matches.matches.notes, *told.statements]}
     return CheckResult(
         model=model, cameras=cameras, pairs=pairs, quality=quality, facts=CheckedFacts(**facts)
     )

@@ -91,7 +91,8 @@ def locate(
             refuse_unknown_names(options.gauge.known_distance, given.names, "the model has no posed image")
             if options.freedom.rigs == "free" and not given.has_rigs:
                 raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
-            matches = stack.enter_context(closing(open_matches(model, inputs)))
+            opened, inputs = open_matches(model, inputs)
+            matches = stack.enter_context(closing(opened))
             wanted = options.freedom.intrinsics
             images, intrinsics = settle_intrinsics(given, matches.file, wanted, inputs.left_out, listed)
             known = read_known(images, matches.file, priors, options.gauge.control_points)
@@ -115,11 +116,11 @@ def locate(
             known=known,
         )
         place = partial(settle, options=options, clock=clock)
-        sigma_rad = told.pull_rad
-        if sigma_rad is None or not _ROUGH_RAD <= sigma_rad < np.inf:
-            return act(place, told, source, options)
-        if rigid.fixed.any():
-            found = act(place, told, source, options)
-            return replace(found, warnings=(_NOT_CORRECTED, *found.warnings))
-        place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
-        return act(place, told, source, options)
+        sigma_rad, notes = told.pull_rad, matches.notes
+        if sigma_rad is not None and _ROUGH_RAD <= sigma_rad < np.inf:
+            if rigid.fixed.any():
+                notes = (_NOT_CORRECTED, *notes)
+            else:
+                place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
+        found = act(place, told, source, options)
+        return replace(found, warnings=(*notes, *found.warnings)) if notes else found

@@ -135,6 +135,8 @@ class Matches(ABC):
     """Number of keypoints of each image; 0 where the file does not have it."""
     total_keypoints: int
     """Number of keypoints of all images of the file."""
+    notes: Sequence[str] = ()
+    """What of the file was read otherwise than it stands there, a sentence each."""
 
     def __init__(self) -> None:
         self._views: WeakSet[View] = WeakSet()

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
+from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID, refuse_no_features
 from sfm_shapefit.files.colmap.database_rigs import DatabaseRigs, read_rigs
 from sfm_shapefit.files.colmap.images import images_of, sensors_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
@@ -84,6 +84,7 @@ def read_images(file: DatabaseFile) -> UnposedImages:
     for image_id, name, camera_id in images:
         is_sound = is_between(image_id, 0, MAX_NUM_IMAGES) and isinstance(name, str)
         if not (is_sound and is_between(camera_id, 0, NO_ID) and model.exists_camera(camera_id)):
+            refuse_no_features(file)
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid name and camera; it is damaged"
             )

@@ -149,7 +149,10 @@ Rows = list[tuple[Any, ...]]
 def _read_tables(database: DatabaseFile, left_out: PairNames) -> dict[str, Rows]:
     """Return the rows that the view graph is made of: cameras, images, and the pairs of most matches."""
     most = _MOST_PAIRS + len(left_out)
-    which = f"WHERE F IS NOT NULL AND length(F) = 72 ORDER BY rows DESC, pair_id LIMIT {most}"
+    is_whole = (
+        "typeof(F) = 'blob' AND length(F) = 72 AND typeof(pair_id) = 'integer' AND typeof(rows) = 'integer'"
+    )
+    which = f"WHERE {is_whole} ORDER BY rows DESC, pair_id LIMIT {most}"
     found = {
         table: database.rows(table, {columns: f"SELECT {', '.join(columns)} FROM {table} {chosen}"})
         for table, columns, chosen in (
