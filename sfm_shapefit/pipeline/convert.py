@@ -4,13 +4,11 @@ Only COLMAP's formats hold all points; a mesh shows as many as `report.html` doe
 the colors of their trust. A new format is a line of `FORMATS`, and the file of the function that it names.
 """
 
-import os
-import secrets
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from sfm_shapefit.base.atomic_folder import MARKER, atomic_folder
+from sfm_shapefit.base.atomic_folder import MARKER, atomic_file, atomic_folder
 from sfm_shapefit.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,6 +36,8 @@ FORMATS = {
     "glb": ExportFormat("a mesh of cameras and points for 3D viewers", (".glb",)),
     "ply": ExportFormat("the same in the model's own axes", (".ply",)),
 }
+
+_FOLDERS = {"colmap", "colmap-txt"}
 
 
 def convert(
@@ -67,6 +67,7 @@ def convert(
     from sfm_shapefit.files.colmap.other_programs import reconstruction_of
     from sfm_shapefit.files.colmap.seed import write_model
     from sfm_shapefit.files.opensfm import read_opensfm
+    from sfm_shapefit.pipeline.write import refuse_file
 
     path = Path(target)
     name = target_format or _format_of(path)
@@ -74,18 +75,23 @@ def convert(
         raise InputError(f"{name!r} is no format to write; give one of {', '.join(FORMATS)}")
     source = model_of(source)
     protect = [source] if isinstance(source, Path | str) else []
+    if name not in _FOLDERS:
+        refuse_file(path, overwrite=overwrite, protect=protect)
     if isinstance(source, Path | str) and Path(source).suffix.lower() == ".json":
         source = reconstruction_of(read_opensfm(Path(source)))
     if name in {"glb", "ply"}:
         from sfm_shapefit.report.mesh import mesh_bytes
 
-        _write_file(mesh_bytes(_drawing_of(source), name), path, overwrite=overwrite)
+        content = mesh_bytes(_drawing_of(source), name)
+        with atomic_file(path) as partial:
+            partial.write_bytes(content)
         return name
     model = read_model(source)
     if FORMATS[name].text_of:
         module, _, function = FORMATS[name].text_of.partition(":")
         text: str = getattr(import_module(f"sfm_shapefit.files.{module}"), function)(model.images)
-        _write_file(text.encode(errors="surrogateescape"), path, overwrite=overwrite)
+        with atomic_file(path) as partial:
+            partial.write_bytes(text.encode(errors="surrogateescape"))
         return name
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path} is a folder with files, which is never replaced; choose another name")
@@ -112,17 +118,3 @@ def _drawing_of(source: "ModelSource") -> "Drawing":
     if not any((Path(source) / f"images{suffix}").exists() for suffix in (".bin", ".txt")):
         raise InputError(f"{source} is of a bare graph and has no model; its report.html has the scene")
     return draw_model(read_model(source), read_trust(Path(source) / "cameras.csv"))
-
-
-def _write_file(content: bytes, path: Path, *, overwrite: bool) -> None:
-    """Write a file whole or not at all."""
-    from sfm_shapefit.pipeline.write import refuse_file
-
-    refuse_file(path, overwrite=overwrite)
-    partial = path.with_name(f".shapefit-{secrets.token_hex(8)}.partial")
-    try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from error

@@ -10,6 +10,7 @@ from sfm_shapefit.base.atomic_folder import MARKER
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import ModelSource, read_model
 from sfm_shapefit.files.colmap.priors import enu_of, read_position_table
+from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.scene.evaluation import (
     Evaluation,
     PositionEvaluation,
@@ -85,7 +86,7 @@ def _datum_of(model: Path) -> Datum | None:
     if not (model / MARKER).is_file():
         return None
     try:
-        facts = json.loads((model / MARKER).read_text(encoding="utf-8"))
+        facts = json.loads(text_of(model / MARKER))
         found = facts.get("datum")
         return None if found is None else Datum(**found)
     except (ValueError, TypeError, AttributeError) as error:

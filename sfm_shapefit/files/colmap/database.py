@@ -22,6 +22,7 @@ from sfm_shapefit.files.colmap.database_pairs import (
     geometries_of,
     match_names,
     read_pairs,
+    refuse_no_features,
 )
 from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.sorted_matches import MOST_MATCHES, SortedMatches
@@ -101,7 +102,10 @@ class DatabaseMatches(Matches):
         self._num_wrong, self._first_wrong = 0, -1
         damage = Damage(file)
         rows = read_pairs(file, index_of_id, damage) if sound is None else sound.rows
-        rows = self._without_unreadable(rows, damage) if sound is None else rows
+        if sound is None:
+            if len(rows.pairs):
+                refuse_no_features(file)
+            rows = self._without_unreadable(rows, damage)
         self.rows, self.pairs, self.num_matches = rows, rows.pairs, rows.num_inliers
         is_kept = float(self.num_matches.sum(dtype=np.float64)) <= MOST_MATCHES
         self._sorted = SortedMatches(self.num_matches) if is_kept else None
