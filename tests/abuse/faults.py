@@ -5,6 +5,7 @@ left behind gone after the next run.
 """
 
 import argparse
+import itertools
 import os
 import resource
 import shutil
@@ -15,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +32,17 @@ _EXTRA_MEMORY = tuple(megabytes * 10**6 for megabytes in (0, 2, 5, 10, 20, 40, 8
 """Bytes by which the address space may grow beyond what the idle process maps."""
 _FILE_SIZES = (0, 8, 100, 1000, 3000, 6000)
 """Bytes that a file may have."""
+_OTHERS = {
+    "synth": ("place/out", "--num-images", "4", "--num-points", "60"),
+    "map": ("database.db", "place/out", "-q"),
+    "join": ("sparse/0", "again", "place/out", "-q"),
+    "convert": ("sparse/0", "place/out", "-q"),
+    "convert glb": ("sparse/0", "place/o.glb", "-q"),
+    "convert json": ("sparse/0", "place/o.json", "-q"),
+    "check": ("sparse/0", "--report", "place/o.html", "--no-second-opinion"),
+    "evaluate": ("sparse/0", "truth", "--csv", "place/o.csv"),
+}
+"""Arguments of other commands, which write a folder or a file into `place`."""
 _INTERRUPTED = "sfm-shapefit: interrupted; nothing was written\n"
 _COMPLETE = "sfm-shapefit: interrupted; the output is complete\n"
 
@@ -53,6 +65,8 @@ def run(args):
     checks |= {
         "files that may not grow": partial(starve, resource.RLIMIT_FSIZE, _FILE_SIZES),
         "a full disk": full_disk,
+        "a full disk, other commands": partial(no_room, True),
+        "files that may not grow, other commands": partial(no_room, False),
         "little memory": partial(starve, resource.RLIMIT_AS, _EXTRA_MEMORY),
         f"two runs at once, {args.rivals} times": partial(rivals, args.rivals),
         "a read-only input": read_only_input,
@@ -89,13 +103,15 @@ class Bench:
         assert outcome.code == 0, outcome.stderr
         return time.perf_counter() - start
 
-    def prepare(self):
-        """Make a fresh folder with the input."""
+    def prepare(self, *names, **copies):
+        """Make a fresh folder with the input, and with further parts of the scene, by these or new names."""
         shutil.rmtree(self.folder, ignore_errors=True)
         for name in ("tmp", "place"):
             (self.folder / name).mkdir(parents=True)
         shutil.copytree(self.base / "sparse", self.folder / "sparse")
         shutil.copyfile(self.base / "database.db", self.folder / "database.db")
+        for new, name in (*zip(names, names, strict=True), *copies.items()):
+            shutil.copytree(self.base / name, self.folder / new)
         self.before = fingerprint(self.folder)
 
     def arguments(self, *extra, out="place/out"):
@@ -216,6 +232,49 @@ def full_disk(bench):
                 bench.endings["left out: no file system can be mounted here"] += 1
                 return
             yield from bench.judge(bench.locate("-q"), f"{pages} pages")
+
+
+def no_room(on_disk, bench):
+    """Other commands in a place without room, or whose files may not grow, also over an earlier output."""
+    for label, arguments in _OTHERS.items():
+        command = (label.split()[0], *arguments)
+        bench.prepare("truth", again="sparse/0")
+        run_forked(partial(command_line, command, bench.folder / "tmp"), bench.folder, bench.writable)
+        earlier = shutil.copytree(bench.folder / "place", bench.folder.parent / "earlier", dirs_exist_ok=True)
+        size = sum(4096 + path.stat().st_size for path in earlier.rglob("*"))
+        for pages, again in itertools.product((1, 2, 4, 8, 16), (False, True)):
+            if again and label in ("synth", "convert"):  # folders of theirs are never replaced
+                continue
+            bench.prepare("truth", again="sparse/0")
+            room = pages * 4096 + (size if again and on_disk else 0)
+            with _small_disk(bench.folder / "place", room) if on_disk else nullcontext(True) as mounted:
+                if not mounted:
+                    bench.endings["left out: no file system can be mounted here"] += 1
+                    return
+                if again:
+                    shutil.copytree(earlier, bench.folder / "place", dirs_exist_ok=True)
+                main = partial(_run_limited, None if on_disk else room, (*command, *["--overwrite"] * again))
+                yield from _after_no_room(bench, main, f"{label}, {pages} pages, {again}")
+        shutil.rmtree(earlier)
+
+
+def _run_limited(most_bytes, command):
+    """Be `sfm-shapefit`, whose files may not be larger than so many bytes."""
+    if most_bytes is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+    command_line(command, Path("tmp").absolute())
+
+
+def _after_no_room(bench, main, label):
+    """Run a command: it must succeed, or change nothing and say one sentence that names no private place."""
+    before = fingerprint(bench.folder)
+    code, _, stderr, *_ = bench.note(run_forked(main, bench.folder, bench.writable))
+    if code not in (0, 3) or (code and stderr.count("\n") != 1):
+        yield f"{label}: exit {code}, {stderr[-300:]!r}"
+    if ".partial" in stderr:
+        yield f"{label}: names its private place: {stderr[-300:]!r}"
+    if code and fingerprint(bench.folder) != before:
+        yield f"{label}: failed, and left or changed something"
 
 
 @contextmanager
