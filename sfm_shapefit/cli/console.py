@@ -138,6 +138,15 @@ def catch_termination() -> None:
             signal.signal(number, _interrupt)
 
 
+def ignore_signals() -> None:
+    """Let what asks this process to end pass from here on, since it ends, with the exit code of what it did.
+
+    As it ends, the interpreter puts its own handlers back, by which a signal would be its end.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
 def _interrupt(number: int, _frame: object) -> None:
     _received.append(number)
     raise KeyboardInterrupt

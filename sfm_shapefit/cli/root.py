@@ -15,6 +15,7 @@ from sfm_shapefit import __version__
 from sfm_shapefit.cli.console import (
     EXIT_INTERRUPTED,
     catch_termination,
+    ignore_signals,
     open_closed_streams,
     refuse_little_memory,
     repeat_lost_interrupts,
@@ -129,3 +130,5 @@ def run_command() -> None:
         app()
     except KeyboardInterrupt:  # outside a command: while modules are loaded
         sys.exit(EXIT_INTERRUPTED)
+    finally:
+        ignore_signals()

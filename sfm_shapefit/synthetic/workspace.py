@@ -19,6 +19,7 @@ import pycolmap
 
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.synthetic import models
 from sfm_shapefit.synthetic.models import ModelParts
@@ -48,7 +49,8 @@ def workspace_folder(out: Path) -> Iterator[Path]:
     """Yield the folder of `atomic_folder`, whose InputError the errors of COLMAP's own writers become too."""
     with atomic_folder(out) as workspace:
         try:
-            yield workspace
+            with quiet_log():  # of which the error says enough
+                yield workspace
         except (RuntimeError, sqlite3.Error) as error:
             raise InputError(
                 f"{out} cannot be written; check the free space, or choose another place"

@@ -21,6 +21,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 
 from tests.abuse import verdicts
 from tests.abuse.fuzz import caches, command_line, make_base, warm_locate
@@ -33,9 +34,9 @@ _EXTRA_MEMORY = tuple(megabytes * 10**6 for megabytes in (0, 2, 5, 10, 20, 40, 8
 _FILE_SIZES = (0, 8, 100, 1000, 3000, 6000)
 """Bytes that a file may have."""
 _OTHERS = {
-    "synth": ("place/out", "--num-images", "4", "--num-points", "60"),
+    "synth": ("place/out", "--num-images", "4", "--num-points", "400"),
     "map": ("database.db", "place/out", "-q"),
-    "join": ("sparse/0", "again", "place/out", "-q"),
+    "join": ("first", "second", "place/out", "--database", "database.db", "-q"),
     "convert": ("sparse/0", "place/out", "-q"),
     "convert glb": ("sparse/0", "place/o.glb", "-q"),
     "convert json": ("sparse/0", "place/o.json", "-q"),
@@ -51,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser):
     parser.add_argument("--moments", type=int, default=50, help="per signal, in a warm process")
     parser.add_argument("--cold", type=int, default=5, help="per signal, in processes of their own")
     parser.add_argument("--rivals", type=int, default=20, help="rounds of two runs into the same place")
+    parser.add_argument("--rooms", type=int, default=5, help="sizes of a place without room, per command")
     parser.add_argument("--seed", type=int, default=0)
 
 
@@ -65,8 +67,8 @@ def run(args):
     checks |= {
         "files that may not grow": partial(starve, resource.RLIMIT_FSIZE, _FILE_SIZES),
         "a full disk": full_disk,
-        "a full disk, other commands": partial(no_room, True),
-        "files that may not grow, other commands": partial(no_room, False),
+        "a full disk, other commands": partial(no_room, args.rooms, True),
+        "files that may not grow, other commands": partial(no_room, args.rooms, False),
         "little memory": partial(starve, resource.RLIMIT_AS, _EXTRA_MEMORY),
         f"two runs at once, {args.rivals} times": partial(rivals, args.rivals),
         "a read-only input": read_only_input,
@@ -91,6 +93,12 @@ class Bench:
 
     def __init__(self, work):
         self.base, self.folder = make_base(work / "base"), work / "case"
+        for name, left_out in (("first", (1, 2)), ("second", (5, 6))):
+            half = pycolmap.Reconstruction(self.base / "sparse" / "0")
+            for frame in left_out:
+                half.deregister_frame(frame)
+            (self.base / name).mkdir()
+            half.write(self.base / name)
         self.expected = warm_locate(self.base)["database"]
         self.writable = [self.folder, *caches()]
         self.endings, self.before = Counter(), {}
@@ -103,15 +111,15 @@ class Bench:
         assert outcome.code == 0, outcome.stderr
         return time.perf_counter() - start
 
-    def prepare(self, *names, **copies):
-        """Make a fresh folder with the input, and with further parts of the scene, by these or new names."""
+    def prepare(self, *names):
+        """Make a fresh folder with the input, and with further parts of the scene."""
         shutil.rmtree(self.folder, ignore_errors=True)
         for name in ("tmp", "place"):
             (self.folder / name).mkdir(parents=True)
         shutil.copytree(self.base / "sparse", self.folder / "sparse")
         shutil.copyfile(self.base / "database.db", self.folder / "database.db")
-        for new, name in (*zip(names, names, strict=True), *copies.items()):
-            shutil.copytree(self.base / name, self.folder / new)
+        for name in names:
+            shutil.copytree(self.base / name, self.folder / name)
         self.before = fingerprint(self.folder)
 
     def arguments(self, *extra, out="place/out"):
@@ -234,18 +242,18 @@ def full_disk(bench):
             yield from bench.judge(bench.locate("-q"), f"{pages} pages")
 
 
-def no_room(on_disk, bench):
+def no_room(rooms, on_disk, bench):
     """Other commands in a place without room, or whose files may not grow, also over an earlier output."""
     for label, arguments in _OTHERS.items():
         command = (label.split()[0], *arguments)
-        bench.prepare("truth", again="sparse/0")
+        bench.prepare("truth", "first", "second")
         run_forked(partial(command_line, command, bench.folder / "tmp"), bench.folder, bench.writable)
         earlier = shutil.copytree(bench.folder / "place", bench.folder.parent / "earlier", dirs_exist_ok=True)
         size = sum(4096 + path.stat().st_size for path in earlier.rglob("*"))
-        for pages, again in itertools.product((1, 2, 4, 8, 16), (False, True)):
+        for pages, again in itertools.product((16, 4, 1, 2, 8)[:rooms], (False, True)):
             if again and label in ("synth", "convert"):  # folders of theirs are never replaced
                 continue
-            bench.prepare("truth", again="sparse/0")
+            bench.prepare("truth", "first", "second")
             room = pages * 4096 + (size if again and on_disk else 0)
             with _small_disk(bench.folder / "place", room) if on_disk else nullcontext(True) as mounted:
                 if not mounted:
