@@ -62,6 +62,9 @@ def run(args):
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         warm, cold = rng.random(args.moments), rng.random(args.cold)
         checks[f"{number.name} at {args.moments} moments"] = partial(signals, number, warm)
+        checks[f"{number.name} at {args.moments} moments, other commands"] = partial(
+            signals_of_others, number, rng.random(args.moments)
+        )
         if args.cold:
             checks[f"{number.name} at {args.cold} moments, cold"] = partial(cold_signals, number, cold)
     checks |= {
@@ -175,6 +178,58 @@ def signals(number, moments, bench):
         outcome = bench.note(child.finish())
         accepted = {0, -number if number == signal.SIGKILL else 130}
         yield from _after_signal(bench, outcome.code, outcome.stderr, accepted, overwrite=overwrite)
+
+
+def signals_of_others(number, moments, bench):
+    """Send a signal at random moments of other commands, each of which replaces an earlier output or file."""
+    for k, moment in enumerate(moments.tolist()):
+        label = list(_OTHERS)[k % len(_OTHERS)]
+        command, again = (label.split()[0], *_OTHERS[label]), label not in ("synth", "convert")
+        bench.prepare("truth", "first", "second")
+        started = time.perf_counter()
+        if again:
+            run_forked(partial(command_line, command, bench.folder / "tmp"), bench.folder, bench.writable)
+        duration_s = time.perf_counter() - started if again else bench.duration_s
+        inputs = {name: kind for name, kind in fingerprint(bench.folder).items() if name[:5] != "place"}
+        main = partial(command_line, (*command, *["--overwrite"] * again), bench.folder / "tmp")
+        child = start_forked(main, bench.folder, bench.writable)
+        time.sleep(moment * 1.05 * duration_s)
+        os.kill(child.pid, number)
+        outcome = bench.note(child.finish())
+        if outcome.code not in (0, -number if number == signal.SIGKILL else 130):
+            yield f"{label}: exit {outcome.code}, {outcome.stderr[-300:]!r}"
+        if "Traceback" in outcome.stderr:
+            yield f"{label}: {outcome.stderr[-300:]!r}"
+        yield from (f"{label}: {problem}" for problem in _broken_outputs(bench.folder / "place", again))
+        if number == signal.SIGKILL:
+            later = ("convert", "sparse/0", "place/later.csv", "-q")
+            run_forked(partial(command_line, later, bench.folder / "tmp"), bench.folder, bench.writable)
+        after = fingerprint(bench.folder)
+        yield from (f"{label}: changed {name}" for name in inputs if after.get(name) != inputs[name])
+        yield from (f"{label}: left {name}" for name in after if ".partial" in name or name[:4] == "tmp/")
+
+
+def _broken_outputs(place, again):
+    """Yield which outputs or files in a place are lost, or not whole."""
+    found = sorted(path for path in place.iterdir() if not path.name.startswith("."))
+    if again and not found:
+        yield "the earlier output is gone"
+    for path in found:
+        if path.is_dir():
+            models = {file.parent for file in path.rglob("images.bin")}
+            yield from itertools.chain.from_iterable(map(verdicts.faults_of_model, sorted(models)))
+            if again and not any((path / name).exists() for name in ("locate.json", "map.json")):
+                yield f"{path.name} is not whole"
+            continue
+        content = path.read_bytes()
+        whole = {
+            ".html": content.endswith(b"</html>\n"),
+            ".json": content.endswith(b"}\n") or content.endswith(b"}"),
+            ".csv": content.endswith(b"\n") and content.count(b"\n") == 7,
+            ".glb": int.from_bytes(content[8:12], "little") == len(content),
+        }
+        if not whole[path.suffix]:
+            yield f"{path.name} is not whole"
 
 
 def cold_signals(number, moments, bench):
