@@ -94,7 +94,7 @@ def explain_no_pairs(file: DatabaseFile) -> str:
         return ""
     if configs:
         named = ", ".join(f"{counted(count, 'pair')} {_UNVERIFIED[config]}" for config, count in configs)
-        hint = " (without --TwoViewGeometry.detect_watermark)" if 7 in dict(configs) else ""
+        hint = " (with --TwoViewGeometry.detect_watermark 0)" if 7 in dict(configs) else ""
         return f"{file.path} has no verified matches, but {named}; {missing}{hint}"
     if "rows" in file.columns("matches") and _has_rows(file, "matches"):
         return f"{file.path} has matches but no two-view geometries; {missing} (colmap geometric_verifier)"
