@@ -15,7 +15,7 @@ from sfm_shapefit.base.paths import refuse_irregular_file
 _IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words, for Python does not convert them
 _DATABASE = b"SQLite format 3\0"
 _MOST_BYTES = 8_000_000_000  # bytes of a text; the graph of a million cameras has one
-_BLOCK_BYTES = 2**20  # bytes that are read and looked at together
+_BLOCK_BYTES = 2**20  # bytes that are looked at together; a file that is no text is read no further
 UNIT_TOLERANCE = 1e-3
 """Largest error of the length of a quaternion or direction, or of R R^T; a few printed digits pass."""
 

@@ -87,7 +87,7 @@ def _inputs_of(found: Any) -> list[Path]:
         return [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
     if isinstance(found, MapResult | GraphResult):
         return [found.database if isinstance(found, MapResult) else found.path]
-    read = found.facts.inputs  # of a model that was joined or checked
+    read = found.facts.inputs  # such are models that were joined or checked
     return [Path(path) for path in (read.model, read.database) if path and path != IN_MEMORY]
 
 
@@ -156,9 +156,9 @@ def refuse_file(page: Path, *, overwrite: bool, protect: Iterable[Path | str] = 
 def _is_of(page: Path, source: Path) -> bool:
     """Return whether a file is an input, a companion of one, or a file of a folder that is one."""
     if not source.is_dir():
-        companions = [source.with_name(source.name + suffix) for suffix in _SIDECARS]
-        tracks = [source.with_name("tracks.csv")] if source.suffix.lower() == ".json" else []  # of OpenSfM
-        return any(_is_same(page, one) for one in (source, *companions, *tracks))
+        names = [source.name + suffix for suffix in ("", *_SIDECARS)]
+        names += ["tracks.csv"] * (source.suffix.lower() == ".json")  # OpenSfM's
+        return any(_is_same(page, source.with_name(name)) for name in names)
     if not page.exists():
         return False
     if Path(os.path.realpath(page)).is_relative_to(os.path.realpath(source)):

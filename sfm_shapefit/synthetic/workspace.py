@@ -49,7 +49,7 @@ def workspace_folder(out: Path) -> Iterator[Path]:
     """Yield the folder of `atomic_folder`, whose InputError the errors of COLMAP's own writers become too."""
     with atomic_folder(out) as workspace:
         try:
-            with quiet_log():  # of which the error says enough
+            with quiet_log():
                 yield workspace
         except (RuntimeError, sqlite3.Error) as error:
             raise InputError(

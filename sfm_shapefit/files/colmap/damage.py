@@ -1,9 +1,9 @@
-"""Damaged rows of a database: a few are left aside, which is said; of more the database is refused."""
+"""Damaged rows of a database: a few are left aside, which is told; with more the database is refused."""
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 
-_MOST = 0.01  # share of the rows of a kind that may be damaged, beside a single one
+_MOST = 0.01  # share of the rows of a kind that may be damaged; a file with more is wrong elsewhere too
 
 
 class Damage:
@@ -13,13 +13,7 @@ class Damage:
         self._file, self._left = file, list[str]()
 
     def leave_aside(self, count: int, total: int, what: str, first: str) -> None:
-        """Leave aside `count` of `total` rows or parts of rows.
-
-        Args:
-            count: how many are damaged.
-            total: how many there are of their kind.
-            what: the name of the kind, in the plural.
-            first: a clause that names the first of them and what is wrong with it.
+        """Leave aside `count` of `total` things, called `what`; `first` names one and says what is wrong.
 
         Raises:
             InputError: if more than one in a hundred is damaged, and more than one.

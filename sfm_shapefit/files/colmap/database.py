@@ -19,8 +19,8 @@ from sfm_shapefit.files.colmap.damage import Damage
 from sfm_shapefit.files.colmap.database_pairs import (
     PairRows,
     check_schema,
-    geometries_of,
     match_names,
+    pair_table,
     read_pairs,
     refuse_no_features,
 )
@@ -36,7 +36,7 @@ PIXEL_BYTES, MOST_KEYPOINTS = 8, 10_000_000
 dozen times."""
 
 _HALF = np.uint64(32)  # bits of a keypoint's number; a match is one number of two of them
-_SURVEYED = 250_000  # matches that are looked at together as a database is opened
+_SURVEYED = 250_000  # matches that are looked at together; as many as are read together later
 
 
 def find_database(model_folder: Path) -> Path | None:
@@ -89,7 +89,7 @@ class DatabaseMatches(Matches):
         super().__init__()
         self.file, self.names, self.notes = file, tuple(names), file.notes
         check_schema(file)
-        self._table = geometries_of(file)
+        self._table = pair_table(file)
         index_of_id = match_names(file, names)
         self._ids = {self.names[index]: i for i, index in index_of_id.items() if index >= 0}
         self.missing_names = tuple(name for name in names if name not in self._ids)
@@ -101,11 +101,7 @@ class DatabaseMatches(Matches):
         self._broken = {} if sound is None else {**sound.broken}
         self._num_wrong, self._first_wrong = 0, -1
         damage = Damage(file)
-        rows = read_pairs(file, index_of_id, damage) if sound is None else sound.rows
-        if sound is None:
-            if len(rows.pairs):
-                refuse_no_features(file)
-            rows = self._without_unreadable(rows, damage)
+        rows = self._readable_pairs(index_of_id, damage) if sound is None else sound.rows
         self.rows, self.pairs, self.num_matches = rows, rows.pairs, rows.num_inliers
         is_kept = float(self.num_matches.sum(dtype=np.float64)) <= MOST_MATCHES
         self._sorted = SortedMatches(self.num_matches) if is_kept else None
@@ -113,8 +109,11 @@ class DatabaseMatches(Matches):
             self._survey(damage)
             damage.tell()
 
-    def _without_unreadable(self, rows: PairRows, damage: Damage) -> PairRows:
+    def _readable_pairs(self, index_of_id: dict[int, int], damage: Damage) -> PairRows:
         """Return the pairs of images whose keypoints can be read; others have none from now on."""
+        rows = read_pairs(self.file, index_of_id, damage)
+        if len(rows.pairs):
+            refuse_no_features(self.file)
         query = (
             "SELECT image_id FROM keypoints WHERE typeof(rows) != 'integer' OR rows != 0 AND "
             "(rows < 0 OR cols NOT IN (2, 4, 6) OR typeof(data) != 'blob' OR length(data) != 4 * rows * cols)"
@@ -170,11 +169,9 @@ class DatabaseMatches(Matches):
         """Return the same from the file."""
         query = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
         found = self.file.query(query, self._ids[name]) if name in self._ids else []
-        if not found or not found[0][0]:
-            return np.zeros((0, 2), dtype=np.float32)
-        rows, cols, data = found[0]
+        rows, cols, data = found[0] if found else (0, 0, b"")
         if cols not in (2, 4, 6) or not is_blob(data, rows, cols, itemsize=4):
-            return np.zeros((0, 2), dtype=np.float32)  # which was said when the file was opened
+            return np.zeros((0, 2), dtype=np.float32)  # what is damaged was told when the file was opened
         xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float32)
         is_finite = np.isfinite(xy).all(axis=1)
         if not is_finite.all():

@@ -24,9 +24,9 @@ MAX_NUM_IMAGES = 2147483647
 NO_ID = 2**32 - 1
 """Id of nothing; COLMAP's ids are 32-bit, and this one is none."""
 
-# COLMAP's TwoViewGeometryConfiguration; what the first list is not verified.
 _UNVERIFIED = {0: "UNDEFINED", 1: "DEGENERATE", 7: "WATERMARK"}
-_VERIFIED = (2, 3, 4, 5, 6, 8, 9)
+"""Values of COLMAP's TwoViewGeometryConfiguration; the matches of such pairs are not verified."""
+_VERIFIED = (2, 3, 4, 5, 6, 8, 9)  # all others; a later COLMAP's are unknown, and may mean anything
 
 _GEOMETRIES, _INLIER_MATCHES = "two_view_geometries", "inlier_matches"  # tables; the second is the older
 _REQUIRED_COLUMNS = {
@@ -48,7 +48,7 @@ class PairRows(NamedTuple):
     num_inliers: IntArray
 
 
-def geometries_of(file: DatabaseFile) -> str:
+def pair_table(file: DatabaseFile) -> str:
     """Return the table of verified matches: that of an old COLMAP only where the newer one has no row."""
     old = file.columns(_INLIER_MATCHES)
     if not old or (file.columns(_GEOMETRIES) and file.query(f"SELECT 1 FROM {_GEOMETRIES} LIMIT 1")):
@@ -65,7 +65,7 @@ def check_schema(file: DatabaseFile) -> None:
         file.refuse_computed(table)
     for table in ("images", "cameras"):
         file.refuse_mistyped(table)
-    geometries = geometries_of(file)
+    geometries = pair_table(file)
     for name, required in _REQUIRED_COLUMNS.items():
         table = geometries if name == _GEOMETRIES else name
         columns = file.columns(table)
@@ -88,7 +88,7 @@ def refuse_no_features(file: DatabaseFile) -> None:
 
 def explain_no_pairs(file: DatabaseFile) -> str:
     """Return which step of COLMAP a database lacks before it has verified matches; empty if it has some."""
-    table, missing = geometries_of(file), "match the images and verify them geometrically first"
+    table, missing = pair_table(file), "match the images and verify them geometrically first"
     configs = file.query(f"SELECT {_config(file, table)}, count(*) FROM {table} WHERE rows > 0 GROUP BY 1")
     if any(config not in _UNVERIFIED for config, _ in configs):
         return ""
@@ -146,7 +146,7 @@ def read_pairs(file: DatabaseFile, index_of_id: dict[int, int], damage: Damage) 
 
     Rows that cannot be used are left aside.
     """
-    table = geometries_of(file)
+    table = pair_table(file)
     config = _config(file, table)
     are_integers = " AND ".join(f"typeof({value}) = 'integer'" for value in ("pair_id", "rows", config))
     is_whole = f"{are_integers} AND cols = 2 AND typeof(data) = 'blob' AND length(data) = 8 * rows"

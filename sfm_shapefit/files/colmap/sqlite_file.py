@@ -30,7 +30,7 @@ _LOCK_TIMEOUT_S = 2.0  # seconds; another program that writes is waited for so l
 _AT_ONCE = 500  # rows that are looked up by one statement; four times faster than one by one
 _COPY_ATTEMPTS = 3  # copies; a file that changes during each of them is in use
 
-_MOST_SHOWN = 40  # letters of a wrong value in a message
+_MOST_SHOWN = 40  # letters of a wrong value in a message; a blob may have millions
 _NUMBERS = {
     "cameras": frozenset({"camera_id", "model", "width", "height", "prior_focal_length"}),
     "images": frozenset({"image_id", "camera_id"}),
