@@ -227,14 +227,20 @@ def _factor(factor: ReducedFactor, system: ReducedSystem) -> None:
 
 
 def _dual(motions: FloatArray, nodes: IntArray) -> FloatArray:
-    """Return F (F^T N)^-1, (N, 6, f), which reads the motions off the centers of some nodes."""
+    """Return F (F^T N)^-1, (N, 6, f), which reads the motions off the centers of some nodes.
+
+    UnsolvableError if these nodes do not tell the motions, as where all stand at one place.
+    """
     dual, own = np.zeros_like(motions), motions[nodes]
     dual[nodes, :3] = own[:, :3]
     gram = np.einsum("nai,naj->ij", dual, motions)
-    if np.linalg.eigvalsh(gram)[0] < _COLLINEAR * np.linalg.eigvalsh(gram)[-1]:
-        dual[nodes, 3:] = own[:, 3:] * np.sum(own[:, :3] ** 2) / np.sum(own[:, 3:] ** 2)
-        gram = np.einsum("nai,naj->ij", dual, motions)
-    read: FloatArray = dual @ np.linalg.inv(gram)
+    try:
+        if np.linalg.eigvalsh(gram)[0] < _COLLINEAR * np.linalg.eigvalsh(gram)[-1]:
+            dual[nodes, 3:] = own[:, 3:] * np.sum(own[:, :3] ** 2) / np.sum(own[:, 3:] ** 2)
+            gram = np.einsum("nai,naj->ij", dual, motions)
+        read: FloatArray = dual @ np.linalg.inv(gram)
+    except np.linalg.LinAlgError:
+        raise UnsolvableError("its cameras do not stand apart where the adjustment has them") from None
     return read
 
 

@@ -1,4 +1,5 @@
-"""Folders that appear whole or not at all: written in a private folder beside their place, then renamed.
+"""Folders and files that appear whole or not at all: written in a private folder beside their place, then
+renamed.
 
 A rename inside one file system is atomic: nobody ever sees a folder that is half written. With `overwrite`
 old and new change places in one step where the system can (Linux: renameat2); elsewhere the old one is moved
@@ -96,6 +97,24 @@ def atomic_folder(
                 shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
         raise InputError(f"{out} cannot be written ({error.strerror}); choose another place") from error
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield the place of a new file that becomes `path`, or takes its place, when the block ends.
+
+    It vanishes if the block raises; `path` has not changed then.
+
+    Raises:
+        InputError: if another run is writing it, or it cannot be written: any OSError of the block.
+    """
+    target = Path(os.path.abspath(path))
+    try:
+        with _claim(target) as private:
+            yield private / target.name
+            os.replace(private / target.name, target)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}); choose another place") from error
 
 
 _PRIVATE_MODE = 0o700  # permission bits; nobody else may look into a result that is half written

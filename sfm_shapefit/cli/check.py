@@ -68,6 +68,7 @@ def check_command(
         from sfm_shapefit.files.model_folder import refuse_no_model
 
         refuse_no_model(source)
+        from sfm_shapefit.files.colmap.database import find_database
         from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.check import check
@@ -78,7 +79,10 @@ def check_command(
         if report is not None:  # now, not when all is computed
             if report.exists() and not overwrite:
                 read_source(source, database)  # what is wrong with that is said first
-            refuse_file(report, overwrite=overwrite)
+            inputs = [
+                path for path in (source, database or find_database(source), images) if path is not None
+            ]
+            refuse_file(report, overwrite=overwrite, protect=inputs)
         with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
             found = check(source, database, second_opinion=second_opinion, progress=progress)
         if report is not None:

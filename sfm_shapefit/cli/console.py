@@ -101,6 +101,20 @@ def _explain_failure(error: OSError) -> str:
     return f"what there is to print cannot be written ({error.strerror})"
 
 
+def open_closed_streams() -> None:
+    """Open what whoever started this process closed of stdin, stdout and stderr, so that it leads nowhere.
+
+    Else the next files that are opened would take their numbers, and messages would go into these.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # which takes the lowest number that is free
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False))
+
+
 def _forget_stdout() -> None:
     """Let what is still to be printed go nowhere."""
     sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  as long as the process lives
@@ -123,6 +137,15 @@ def catch_termination() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _interrupt)
+
+
+def ignore_signals() -> None:
+    """Let what asks this process to end pass from here on, since it ends, with the exit code of what it did.
+
+    As it ends, the interpreter puts its own handlers back, by which a signal would be its end.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _interrupt(number: int, _frame: object) -> None:

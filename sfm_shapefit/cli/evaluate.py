@@ -65,12 +65,13 @@ def evaluate_command(
     source = one_path(model, input_path, "MODEL")
     truth = one_path(reference, None, "REF")
     with report_errors():
+        from sfm_shapefit.base.atomic_folder import atomic_file
         from sfm_shapefit.facts.tables import write_records
         from sfm_shapefit.pipeline.evaluate import evaluate, evaluate_against_table
         from sfm_shapefit.pipeline.write import refuse_file
 
         if csv is not None:
-            refuse_file(csv, overwrite=overwrite)
+            refuse_file(csv, overwrite=overwrite, protect=[source, truth])
         errors: Evaluation | PositionEvaluation
         if truth.is_file() and truth.suffix.lower() in _TABLES:
             if threshold or trajectory:
@@ -79,7 +80,8 @@ def evaluate_command(
         else:
             errors = evaluate(source, truth, thresholds=threshold or (), trajectory=trajectory)
         if csv is not None:
-            write_records(errors.rows(), csv)
+            with atomic_file(csv) as partial:
+                write_records(errors.rows(), partial)
         if as_json:
             print_json(errors.summary())
         else:

@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperCommand
 
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import S, Settings, hint, homes_of, option, setting_groups
 from sfm_shapefit.cli.console import flag_names, key_names
 from sfm_shapefit.cli.root import convert_plainly
@@ -336,13 +337,14 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
 def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
     """Return the values of a TOML file whose keys are options, or groups of them."""
     from sfm_shapefit.base.paths import refuse_irregular_file
+    from sfm_shapefit.files.lines import text_of
 
     refuse_irregular_file(path)
     try:
-        read = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise typer.BadParameter(f"{path} does not exist") from None
-    except (OSError, ValueError, RecursionError) as error:
+        read = tomllib.loads(text_of(path))
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
+    except (ValueError, RecursionError) as error:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
     homes = homes_of(settings)
     for name in read.keys() - {*homes, *homes.values()}:

@@ -2,7 +2,6 @@
 
 import atexit
 import gc
-import os
 import sys
 from collections.abc import Iterable, Sequence
 from importlib import import_module
@@ -16,6 +15,8 @@ from sfm_shapefit import __version__
 from sfm_shapefit.cli.console import (
     EXIT_INTERRUPTED,
     catch_termination,
+    ignore_signals,
+    open_closed_streams,
     refuse_little_memory,
     repeat_lost_interrupts,
 )
@@ -116,8 +117,7 @@ def load_commands(words: Sequence[str] = ()) -> None:
 
 def run_command() -> None:
     """Run the command line. A request to terminate ends it like an interrupt from the keyboard."""
-    if sys.stdout is None:  # closed by whoever started this process
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    open_closed_streams()
     catch_termination()
     repeat_lost_interrupts()
     gc.set_threshold(*_OBJECTS_BETWEEN_SEARCHES)
@@ -130,3 +130,5 @@ def run_command() -> None:
         app()
     except KeyboardInterrupt:  # outside a command: while modules are loaded
         sys.exit(EXIT_INTERRUPTED)
+    finally:
+        ignore_signals()

@@ -35,7 +35,7 @@ class Inspection(Record, Displayed, repr=False):
     rigs: Annotated[str, "How many frames hang together, if the model has rigs."] = (
         "none: every image is a frame of its own"
     )
-    warnings: Annotated[tuple[str, ...], "What was read otherwise than it stands in the input."] = ()
+    warnings: Annotated[tuple[str, ...], "What was read otherwise than it stands, a sentence each."] = ()
 
     def _headline(self) -> str:
         return f"{self.num_images} images, {self.diagnosis.obstacle or 'which can be placed'}"

@@ -103,6 +103,8 @@ class Inputs:
     """Where the directions came from, and how that choice was made, for the user."""
     left_out: PairNames = frozenset()
     """Pairs that are taken for unmatched."""
+    is_found: bool = False
+    """Whether the database was found beside the model, and nobody asked for it."""
 
     @property
     def facts(self) -> ModelInputs:

@@ -4,6 +4,7 @@
 """
 
 import csv
+import io
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.paths import refuse_irregular_file
+from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.judgement.verdicts import Verdict
 
 TableName = Literal["cameras", "pairs"]
@@ -126,11 +127,10 @@ def read_trust(path: Path) -> dict[str, float]:
     Raises:
         InputError: if the file cannot be read.
     """
-    refuse_irregular_file(path)
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            return {cells["name"]: float(cells["trust"] or "nan") for cells in csv.DictReader(stream)}
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        rows = csv.DictReader(io.StringIO(text_of(path, keeps_returns=True), newline=""))
+        return {cells["name"]: float(cells["trust"] or "nan") for cells in rows}
+    except (InputError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise InputError(f"{path} is damaged or of another version ({error}); run locate again") from error
 
 
@@ -157,17 +157,14 @@ def write_records(records: Sequence[Mapping[str, object]], path: Path) -> None:
 def _write_csv(columns: Mapping[str, Sequence[object]], path: Path) -> None:
     """Write columns under their names; bytes that are no UTF-8, as names may have, appear as \\udcXX."""
     rows = zip(*map(_cells, columns.values()), strict=True)
-    try:
-        with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream:
-            bare = csv.writer(stream, lineterminator="\n")
-            quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
-            bare.writerow(columns)
-            if not any(map(_has_return, columns.values())):
-                bare.writerows(rows)
-            for row in rows:  # a carriage return ends a line for others, which `csv` forgets
-                (quoted if _has_return(row) else bare).writerow(row)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from error
+    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream:
+        bare = csv.writer(stream, lineterminator="\n")
+        quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
+        bare.writerow(columns)
+        if not any(map(_has_return, columns.values())):
+            bare.writerows(rows)
+        for row in rows:  # a carriage return ends a line for others, which `csv` forgets
+            (quoted if _has_return(row) else bare).writerow(row)
 
 
 def _has_return(cells: Sequence[object]) -> bool:

@@ -3,7 +3,6 @@
 import csv
 import re
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ _IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words, for Python 
 _DATABASE = b"SQLite format 3\0"
 _MOST_BYTES = 8_000_000_000  # bytes of a text; the graph of a million cameras has one
 _SEPARATORS, _FEWEST_SEPARATORS = ";\t", 3  # a table of positions has three or more in a line
+_BLOCK_BYTES = 2**20  # bytes that are looked at together; a file that is no text is read no further
 UNIT_TOLERANCE = 1e-3
 """Largest error of the length of a quaternion or direction, or of R R^T; a few printed digits pass."""
 
@@ -51,10 +51,11 @@ def refuse_database(path: Path) -> None:
         )
 
 
-def text_of(file: Path) -> str:
+def text_of(file: Path, *, keeps_returns: bool = False) -> str:
     """Return what an ordinary text file holds, without the byte order mark that editors of Windows put first.
 
-    Bytes that are no UTF-8, of names in other encodings, become lone surrogates as Python's own do.
+    Lines end with \\n alone then, unless the carriage returns are to be kept, which names may have. Bytes
+    that are no UTF-8, of names in other encodings, become lone surrogates as Python's own do.
 
     Raises:
         InputError: if it is none, is missing, cannot be read, or is binary.
@@ -64,16 +65,27 @@ def text_of(file: Path) -> str:
     if _is_huge(file):
         raise InputError(f"{file} has more than {_MOST_BYTES / 1e9:g} GB; is it the right file?")
     try:
-        with suppress(UnicodeDecodeError):
-            return file.read_text(encoding="utf-8-sig")
-        text = file.read_text(encoding="utf-8-sig", errors="surrogateescape")
+        data = _bytes_of(file)
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = data.decode("utf-8-sig", errors="surrogateescape")
+        return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text and not keeps_returns else text
     except FileNotFoundError:
         raise InputError(f"{file} does not exist") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{file} is not a readable text file ({error})") from error
-    if "\0" in text:
-        raise InputError(f"{file} is not a readable text file (it holds bytes that no text has)")
-    return text
+
+
+def _bytes_of(file: Path) -> bytearray:
+    """Return what a text file holds; one with zeros, which no text has, is not read beyond the first."""
+    data = bytearray()
+    with file.open("rb") as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            if b"\0" in block:
+                raise InputError(f"{file} is not a readable text file: it has binary zeros; save it in UTF-8")
+            data += block
+    return data
 
 
 def lines_of_cells(file: Path) -> Iterator[tuple[int, list[str]]]:
@@ -137,10 +149,11 @@ def first_words(file: Path) -> list[str]:
     if not file.is_file() or _is_huge(file):  # a pipe or a device would be read for ever
         return []
     try:
-        with file.open(encoding="utf-8-sig") as stream:
-            return next((words for line in stream if (words := line.split("#", 1)[0].split())), [])
-    except (OSError, ValueError):
+        with file.open("rb") as stream:
+            begin = stream.read(_BLOCK_BYTES).decode("utf-8-sig", errors="ignore")
+    except OSError:
         return []
+    return next((words for line in begin.splitlines() if (words := line.split("#", 1)[0].split())), [])
 
 
 def first_numbers(file: Path, width: int) -> FloatArray | None:

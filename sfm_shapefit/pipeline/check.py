@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.files.colmap.database import DatabaseMatches
@@ -49,8 +49,14 @@ def check(
     other = None
     with open_source(posed, inputs) as source:
         if second_opinion and isinstance(source.matches, DatabaseMatches):
-            with clock("second opinion"):
-                other = _map_anew(source.matches.file, posed, second_opinion, clock.anew())
+            file = source.matches.file
+            try:
+                with clock("second opinion"):
+                    other = _map_anew(file, posed, second_opinion, clock.anew())
+            except InputError as error:
+                if not inputs.is_found:
+                    raise
+                file.notes.append(f"there is no second opinion: {error}")
         return check_source(posed, source, DirectionOptions(), clock, other)
 
 

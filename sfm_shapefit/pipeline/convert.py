@@ -5,14 +5,12 @@ cameras in the colors of their trust. A new format is a line of `FORMATS`, and t
 it names.
 """
 
-import os
-import secrets
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sfm_shapefit.base.atomic_folder import MARKER, atomic_folder
+from sfm_shapefit.base.atomic_folder import MARKER, atomic_file, atomic_folder
 from sfm_shapefit.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -113,8 +111,9 @@ def write_converted(
     name = target_format or _format_of(path)
     if name not in FORMATS:
         raise InputError(f"{name!r} is no format to write; give one of {', '.join(FORMATS)}")
+    protect = [source] if isinstance(source, Path | str) else []
     if name not in _FOLDERS:
-        refuse_file(path, overwrite=overwrite)
+        refuse_file(path, overwrite=overwrite, protect=protect)
     given, source = source, model_of(source)
     trust = _trust_of(source) if name in {"glb", "ply"} else {}
     model = read_by_itself(source, with_lenses=name not in {"tum", "csv"})
@@ -127,7 +126,7 @@ def write_converted(
         told += world.bend_statement(centers)
     told = "; ".join(filter(None, [told, *notes]))
     if name in _FOLDERS:
-        _write_folder(model, path, name, world, [given] if isinstance(given, Path | str) else [])
+        _write_folder(model, path, name, world, protect)
         return Converted(name, (path,), told)
     contents = _contents(name, _Scene(source, model, world, trust, path.stem))
     files = {
@@ -137,9 +136,10 @@ def write_converted(
     if world.offset_line:
         files[path.with_name(f"{path.stem}_offset.xyz")] = world.offset_line
     for file in files:  # before the first is written
-        refuse_file(file, overwrite=overwrite)
+        refuse_file(file, overwrite=overwrite, protect=protect)
     for file, content in files.items():
-        _write_file(content, file, overwrite=overwrite)
+        with atomic_file(file) as partial:
+            partial.write_bytes(content)
     return Converted(name, tuple(files), told)
 
 
@@ -244,17 +244,3 @@ def _trust_of(source: "ModelSource") -> dict[str, float]:
     if not any((Path(source) / f"images{suffix}").exists() for suffix in (".bin", ".txt")):
         raise InputError(f"{source} is of a bare graph and has no model; its report.html has the scene")
     return read_trust(Path(source) / "cameras.csv")
-
-
-def _write_file(content: bytes, path: Path, *, overwrite: bool) -> None:
-    """Write a file whole or not at all."""
-    from sfm_shapefit.pipeline.write import refuse_file
-
-    refuse_file(path, overwrite=overwrite)
-    partial = path.with_name(f".shapefit-{secrets.token_hex(8)}.partial")
-    try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from error

@@ -11,6 +11,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.listed_poses import is_list, read_by_itself
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.priors import in_meters, read_positions
+from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.files.listed_names import named_as
 from sfm_shapefit.scene.evaluation import (
     Evaluation,
@@ -93,7 +94,7 @@ def model_datum(model: Any) -> Datum | None:
     if not file.is_file():
         return None
     try:
-        found = json.loads(file.read_text(encoding="utf-8")).get("datum")
+        found = json.loads(text_of(file)).get("datum")
         return None if found is None else Datum(**found)
     except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{file} cannot be read; run locate again, or remove it") from error

@@ -1,6 +1,6 @@
 """Where matches come from: a database, or the model's own tracks. One place decides, and opens it."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
-from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
 from sfm_shapefit.facts.options import InspectOptions, PlacingOptions, Source
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, open_database
+from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs, refuse_no_features
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.files.pair_list import read_pair_list
@@ -77,11 +78,41 @@ class MatchSource:
         )
 
 
-def open_matches(model: ColmapModel, inputs: Inputs) -> DatabaseMatches | TrackMatches:
-    """Open the matches that were chosen."""
+def open_matches(model: ColmapModel, inputs: Inputs) -> tuple[DatabaseMatches | TrackMatches, Inputs]:
+    """Open the matches that were chosen, and return what is used then.
+
+    A database that was found, and cannot be used, is left aside; the model's own tracks serve.
+
+    Raises:
+        InputError, UnsolvableError: if one that was named cannot be used, or has no verified matches.
+    """
     if inputs.database is None:
-        return TrackMatches(model)
-    return open_database(inputs.database, model.images.names)
+        return TrackMatches(model), inputs
+    try:
+        return open_verified(inputs.database, model.images.names), inputs
+    except ShapeFitError as error:
+        if not inputs.is_found or inputs.left_out:
+            raise
+        statement = f"the model's own tracks; the database beside the model cannot be used: {error}"
+        return TrackMatches(model), replace(inputs, database=None, statement=statement)
+
+
+def open_verified(database: Path, names: Sequence[str]) -> DatabaseMatches:
+    """Open a database that has verified matches of some images, or of others.
+
+    Raises:
+        InputError, UnsolvableError: if it cannot be used; the message says what is to be done first.
+    """
+    matches = open_database(database, names)
+    try:
+        if not len(matches.pairs):
+            refuse_no_features(matches.file)
+            if explained := explain_no_pairs(matches.file):
+                raise UnsolvableError(explained)
+    except ShapeFitError:
+        matches.close()
+        raise
+    return matches
 
 
 def see_matches(
@@ -101,7 +132,8 @@ def open_source(
     model: ColmapModel, inputs: Inputs, options: PlacingOptions | None = None
 ) -> Iterator[MatchSource]:
     """Open the matches that were chosen, as `see_matches` sees them, and close them in the end."""
-    with closing(open_matches(model, inputs)) as matches:
+    opened, inputs = open_matches(model, inputs)
+    with closing(opened) as matches:
         yield see_matches(matches, model.images, inputs, options)
 
 
@@ -140,7 +172,9 @@ def choose_inputs(
         statement = "the model's own tracks; no database.db was given or found beside the model"
         return Inputs(folder=folder, database=None, statement=statement)
     beside = " (found beside the model)" if database is None else ""
-    return replace(inputs_from(path), folder=folder, statement=f"inlier matches of {path}{beside}")
+    statement = f"inlier matches of {path}{beside}"
+    is_found = database is None and source == "auto"
+    return Inputs(folder=folder, database=path, statement=statement, is_found=is_found)
 
 
 def inputs_from(database: Path) -> Inputs:

@@ -75,7 +75,7 @@ def inspect(
             work = describe_work(grouped, count_work(matches, directions, options), options.placement)
             confirmed = confirm_rotations(matches, directions, clock.threads)
             return Inspection(
-                directions=inputs.statement,
+                directions=matches.inputs.statement,
                 num_images=len(model.image_names),
                 statuses={status.value: count for status, count in directions.counts().items()},
                 points=options.nodes.points_statement(images.num_images, with_points.num_points),

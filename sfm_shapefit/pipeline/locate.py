@@ -94,7 +94,8 @@ def locate(
             options = replace(options, gauge=gauge)
             if options.freedom.rigs == "free" and not given.has_rigs:
                 raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
-            matches = stack.enter_context(closing(open_matches(model, inputs)))
+            opened, inputs = open_matches(model, inputs)
+            matches = stack.enter_context(closing(opened))
             wanted = options.freedom.intrinsics
             images, intrinsics = settle_intrinsics(given, matches.file, wanted, inputs.left_out, listed)
             known = read_known(images, matches.file, priors, options.gauge.control_points)
@@ -119,12 +120,12 @@ def locate(
             known=known,
         )
         place = partial(settle, options=options, clock=clock)
-        sigma_rad = told.pull_rad
+        sigma_rad, notes = told.pull_rad, (*notes, *matches.notes)
         if sigma_rad is not None and _ROUGH_RAD <= sigma_rad < np.inf:
             if rigid.fixed.any():
-                notes = (*notes, _NOT_CORRECTED)
+                notes = (_NOT_CORRECTED, *notes)
             else:
                 place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
         with naming_convention(source, clock.threads):
             found = tell_convention(act(place, told, source, options), source, clock.threads)
-        return replace(found, warnings=(*notes, *source.matches.notes, *found.warnings))
+        return replace(found, warnings=(*notes, *found.warnings)) if notes else found

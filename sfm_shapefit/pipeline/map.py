@@ -16,6 +16,7 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.map_result import MapResult, tell_joins
 from sfm_shapefit.facts.map_warnings import lost_distances, map_warnings
 from sfm_shapefit.facts.options import MapOptions
+from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
@@ -78,7 +79,7 @@ def map_opened(
     reasons = dict.fromkeys(range(int(run.frame_of_image.max()) + 1), _UNMATCHED)
     models = locate_components(run, relative, visits, reasons)
     if not models:
-        raise UnsolvableError(_explain_failure(path, relative, reasons))
+        raise UnsolvableError(_explain_failure(file, relative, reasons))
     with clock("join") if options.join == "safe" else nullcontext():
         joins, joined, told = join_mapped(models, run)
     left_out = {**run.read.left_out} | {
@@ -125,13 +126,13 @@ def measure_run(run: MapRun) -> tuple[MapRun, RelativeRotations, Videos, tuple[V
     return run.score_pairs(relative), relative, videos, visits
 
 
-def _explain_failure(path: Path, relative: RelativeRotations, reasons: dict[int, str]) -> str:
+def _explain_failure(file: DatabaseFile, relative: RelativeRotations, reasons: dict[int, str]) -> str:
     """Say why no component could be placed."""
     if len(relative.pairs) == 0:
-        return (
-            f"no pair of images in {path} has {LEAST_MATCHES} inlier matches and a relative rotation; match "
-            "the images and verify them geometrically first"
+        return explain_no_pairs(file) or (
+            f"no pair of images in {file.path} has {LEAST_MATCHES} inlier matches and a relative rotation; "
+            "match the images and verify them geometrically first"
         )
     causes = list(reasons.values())
     most = max(set(causes), key=lambda cause: (causes.count(cause), cause))
-    return f"no component of {path} can be placed; for most images: {most}"
+    return f"no component of {file.path} can be placed; for most images: {most}"

@@ -14,6 +14,7 @@ from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import UnposedImages, read_images
+from sfm_shapefit.files.colmap.database_pairs import refuse_no_features
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
 from sfm_shapefit.pairs.options import LEAST_MATCHES
@@ -40,6 +41,7 @@ def start_run(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Pat
     """Read what a run works from: the database, and the files that the options name."""
     path = file.path
     with clock("read"):
+        refuse_no_features(file)
         read = read_images(file)
         images = read.images
         if options.freedom.rigs == "free" and not images.has_rigs:

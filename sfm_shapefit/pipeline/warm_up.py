@@ -160,10 +160,12 @@ def _run(examples: Iterable[str], num_processes: int) -> Iterator[str | WarmUpEr
 
     context, waiting = get_context("spawn"), list(examples)
     workers, at_work = {}, dict[Any, str]()
+    scratch = tempfile.TemporaryDirectory()  # not of a worker, which may be killed before it removes its own
     try:
         for _ in range(num_processes):
             ours, theirs = context.Pipe()
-            process = context.Process(target=_work, args=(theirs, gc.get_threshold()), daemon=True)
+            given = theirs, scratch.name, gc.get_threshold()
+            process = context.Process(target=_work, args=given, daemon=True)
             process.start()
             theirs.close()
             workers[ours] = process
@@ -187,9 +189,10 @@ def _run(examples: Iterable[str], num_processes: int) -> Iterator[str | WarmUpEr
         for process in workers.values():
             process.kill()
             process.join()
+        scratch.cleanup()
 
 
-def _work(connection: Any, objects_between_searches: tuple[int, int, int]) -> None:
+def _work(connection: Any, scratch: str, objects_between_searches: tuple[int, int, int]) -> None:
     """Run the examples that the connection names, and tell of every kernel.
 
     Unused objects are looked for as often as in the parent: compiling makes very many of them.
@@ -203,8 +206,9 @@ def _work(connection: Any, objects_between_searches: tuple[int, int, int]) -> No
             try:
                 from sfm_shapefit.pipeline import examples
 
-                with tempfile.TemporaryDirectory() as folder:
-                    getattr(examples, name)(Path(folder))
+                folder = Path(scratch, name)
+                folder.mkdir()
+                getattr(examples, name)(folder)
                 note(name, PACKAGE / "pipeline")
             except Exception as error:  # whatever it is, the others are worth running
                 connection.send(WarmUpError(f"{name}: {type(error).__name__}: {error}"))

@@ -5,16 +5,18 @@ bare graph has no model. `map` has such a folder per model, `0`, `1`, ..., and `
 that were joined stand in `joined_0` in one world too.
 """
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_folder
+from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_file, atomic_folder
 from sfm_shapefit.base.display import Reported, Writers, write_by
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.paths import refuse_irregular_file
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
 from sfm_shapefit.facts.map_result import JoinedModel, MapResult
@@ -26,6 +28,15 @@ from sfm_shapefit.files.colmap.seed import write_model
 
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
+
+_SIDECARS = ("-wal", "-journal", "-shm")  # endings of the companions of a database
+_WRITTEN = {".html", ".glb", ".ply", ".csv", ".json", ".tum", ".txt"}
+"""Suffixes of single files that commands write, perhaps into the folder of a model."""
+_READ = {
+    *(MARKER, MAP_MARKER, "cameras.csv", "pairs.csv", "doubtful_pairs.csv"),
+    *(f"{name}.txt" for name in ("cameras", "images", "points3D", "rigs", "frames")),
+}
+"""Files with such suffixes that are part of a model or of an output."""
 
 
 @explained
@@ -72,13 +83,14 @@ def write_result(
             _write_files(found, folder, options)
 
 
-def _inputs_of(found: LocateResult | GraphResult | MapResult | JoinedModel) -> list[Path]:
-    if isinstance(found, JoinedModel):
-        read = found.facts.inputs
-        return [Path(path) for path in (read.model, read.database) if path and path != IN_MEMORY]
+def _inputs_of(found: Any) -> list[Path]:
+    """Return the files and folders that a result was made of."""
     if isinstance(found, LocateResult):
         return [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
-    return [found.database if isinstance(found, MapResult) else found.path]
+    if isinstance(found, MapResult | GraphResult):
+        return [found.database if isinstance(found, MapResult) else found.path]
+    read = found.facts.inputs  # such are models that were joined or checked
+    return [Path(path) for path in (read.model, read.database) if path and path != IN_MEMORY]
 
 
 def _write_files(
@@ -122,23 +134,61 @@ def write_page(
     found: Reported, page: Path | str, *, images: Path | str = "", overwrite: bool = False
 ) -> None:
     """Write the report of a result to a file; see `Reported.report`."""
-    refuse_file(Path(page), overwrite=overwrite)
-    try:
-        has_pictures = _write_report(found, Path(page), images)
-    except OSError as error:
-        raise InputError(f"{page} cannot be written ({error.strerror}); choose another place") from error
+    refuse_file(
+        Path(page), overwrite=overwrite, protect=[*_inputs_of(found), *([images] if str(images) else [])]
+    )
+    with atomic_file(Path(page)) as partial:
+        has_pictures = _write_report(found, partial, images)
     if not has_pictures:
         raise InputError(f"{images} has none of the images, so {page} has no pictures")
 
 
-def refuse_file(page: Path, *, overwrite: bool) -> None:
-    """Refuse a file to be made that exists, or whose folder does not."""
+def refuse_file(page: Path, *, overwrite: bool, protect: Iterable[Path | str] = ()) -> None:
+    """Refuse a file to be made that exists, that an input is or consists of, or whose folder does not exist.
+
+    Args:
+        page: the file.
+        overwrite: accept an ordinary file in its place, but no link.
+        protect: the inputs, files and folders.
+    """
     if not page.absolute().parent.is_dir():
         raise InputError(f"the folder of {page} does not exist; make it, or name another")
     if page.is_dir():
         raise InputError(f"{page} is a folder; give the name of a file")
-    if page.exists() and not overwrite:
+    for source in map(Path, protect):
+        if _is_of(page, source):
+            raise InputError(f"{page} is or belongs to the input {source}; choose another name")
+    if os.path.lexists(page) and not overwrite:
         raise InputError(f"{page} exists already; choose another name, or replace it (overwrite=True)")
+    if page.is_symlink():
+        raise InputError(f"{page} is a symbolic link; give the file that it stands for")
+    refuse_irregular_file(page)
+
+
+def _is_of(page: Path, source: Path) -> bool:
+    """Return whether a file is an input, a companion of one, or a file of a folder that is one."""
+    if not source.is_dir():
+        names = [source.name + suffix for suffix in ("", *_SIDECARS)]
+        names += ["tracks.csv"] * (source.suffix.lower() == ".json")  # OpenSfM's
+        return any(_is_same(page, source.with_name(name)) for name in names)
+    if not page.exists():
+        return False
+    if Path(os.path.realpath(page)).is_relative_to(os.path.realpath(source)):
+        return _is_read(page)
+    return any(_is_read(entry) and _is_same(page, entry) for entry in source.iterdir())
+
+
+def _is_read(member: Path) -> bool:
+    """Return whether a file of a folder may be read as an input: pages, meshes and lists in it are not."""
+    return member.suffix.lower() not in _WRITTEN or member.name in _READ
+
+
+def _is_same(page: Path, other: Path) -> bool:
+    """Return whether two paths, which may not exist, lead to one file, however they are spelled."""
+    try:
+        return page.samefile(other)
+    except OSError:
+        return os.path.realpath(page) == os.path.realpath(other)
 
 
 def _draw_page(found: Any) -> str:

@@ -14,6 +14,7 @@ from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import normalize_locations
 
 _CAP_OF_SIZE = 0.5  # spreads of all cameras; a larger distance from solved to adjusted counts no more
+_COLLAPSED = 1e-9  # spreads of the solution; cameras that fit it with a smaller spread fit it nowhere
 _LEAST_SPREAD = 1e-12  # smallest eigenvalue of a point's sum of projectors; below, its rays are parallel
 # Rounds of "which residuals are inside?" and "how large are these?"; the level settles in about five.
 _ROUNDS = 10
@@ -28,9 +29,11 @@ def stay_near(
     from any origin, in the same axes; `first` is the placement that was adjusted.
     """
     graph, there = measured.graph, solved.locations[: len(centers)]
-    cap = _CAP_OF_SIZE * median_spread(there)
-    locations = solved.locations.copy()
-    locations[: len(centers)] = fit_similarity_l1(centers, there, rotate=False, cap=cap).apply(centers)
+    size, locations = median_spread(there), solved.locations.copy()
+    fit = fit_similarity_l1(centers, there, rotate=False, cap=_CAP_OF_SIZE * size)
+    # Where the solution has nothing of the adjusted cameras, it fits them best with all in one point.
+    is_lost = fit.scale * median_spread(centers) <= _COLLAPSED * size
+    locations[: len(centers)] = centers if is_lost else fit.apply(centers)
     locations = normalize_locations(graph, follow_cameras(measured, locations))
     levels = np.full(int(measured.classes.max()) + 1, OPENING_RAD)
     for _ in range(_ROUNDS):

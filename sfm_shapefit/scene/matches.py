@@ -135,17 +135,14 @@ class Matches(ABC):
     """Number of keypoints of each image; 0 where the file does not have it."""
     total_keypoints: int
     """Number of keypoints of all images of the file."""
+    notes: Sequence[str] = ()
+    """What of the file was read otherwise than it stands there, a sentence each."""
 
     lacking: str = ""
     """What was left aside of the input where no images share matches; empty if nothing was."""
 
     def __init__(self) -> None:
         self._views: WeakSet[View] = WeakSet()
-
-    @property
-    def notes(self) -> Sequence[str]:
-        """What was read otherwise than it stands in the file, a sentence each."""
-        return ()
 
     def at(self, images: Images, left_out: PairNames = frozenset(), reading: Reading = PLENTY) -> "View":
         """Return the matches as other images see them, which is cheap.

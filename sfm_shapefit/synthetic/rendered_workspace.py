@@ -19,7 +19,6 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, sum_by
-from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
@@ -36,7 +35,7 @@ from sfm_shapefit.synthetic.models import (
 )
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rendering import RenderedScene, encode_images, project_distorted, surface_points
-from sfm_shapefit.synthetic.workspace import compact_database
+from sfm_shapefit.synthetic.workspace import compact_database, workspace_folder
 
 _LARGEST_ERROR_PX = 4.0  # pixels; COLMAP's own limit for inliers, a right match is off by no more
 _POINT_GRAY = 160  # gray value of a point; its color in the pictures is not looked up
@@ -78,7 +77,7 @@ def write_rendered_workspace(
             has poses but no points.
     """
     options = options or WorkspaceOptions()
-    with atomic_folder(out) as workspace:
+    with workspace_folder(out) as workspace:
         (workspace / "images").mkdir()
         for k, image in enumerate(encode_images(scene)):
             (workspace / "images" / image_name(k)).write_bytes(image)

@@ -154,7 +154,11 @@ def _undistort(scene: RenderedScene, xy: FloatArray) -> FloatArray:
     pixels = np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 1, 2)
     if len(pixels) == 0:
         return np.empty((0, 2))
-    rays = cv2.undistortPoints(pixels, scene.calibration, scene.distortion, criteria=criteria)
+    lens = pixels, scene.calibration, scene.distortion
+    if (undistort := getattr(cv2, "undistortPointsIter", None)) is not None:  # so OpenCV 4 calls it
+        rays = undistort(*lens, np.eye(3), np.eye(3), criteria)
+    else:
+        rays = cv2.undistortPoints(*lens, criteria=criteria)
     return np.asarray(rays, dtype=np.float64).reshape(-1, 2)
 
 

@@ -11,12 +11,15 @@ which would leave companions beside the file for every reader, so it is switched
 
 import contextlib
 import sqlite3
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.atomic_folder import atomic_folder
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.synthetic import models
 from sfm_shapefit.synthetic.models import ModelParts
@@ -33,12 +36,25 @@ def write_workspace(scene: Scene, out: Path, options: WorkspaceOptions | None = 
     written.
     """
     options = options or WorkspaceOptions()
-    with atomic_folder(out) as workspace:
+    with workspace_folder(out) as workspace:
         if options.database:
             _write_database(scene, workspace / "database.db", relative_poses=options.relative_poses)
         points = _points(scene)
         parts = ModelParts(scene, _camera(scene), scene.keypoints, points, scene.colors[points.ids - 1])
         models.write_models(parts, workspace, options.model)
+
+
+@contextlib.contextmanager
+def workspace_folder(out: Path) -> Iterator[Path]:
+    """Yield the folder of `atomic_folder`, whose InputError the errors of COLMAP's own writers become too."""
+    with atomic_folder(out) as workspace:
+        try:
+            with quiet_log():
+                yield workspace
+        except (RuntimeError, sqlite3.Error) as error:
+            raise InputError(
+                f"{out} cannot be written; check the free space, or choose another place"
+            ) from error
 
 
 def _points(scene: Scene) -> Points:

@@ -16,12 +16,16 @@ _COLUMNS = {
     "keypoints": ("image_id", "rows", "cols", "data"),
     "two_view_geometries": ("pair_id", "rows", "cols", "data", "config", "qvec", "tvec"),
     "cameras": ("camera_id", "model", "width", "height", "params", "prior_focal_length"),
+    "rigs": ("rig_id", "ref_sensor_id", "ref_sensor_type"),
+    "frames": ("frame_id", "rig_id"),
+    "frame_data": ("frame_id", "data_id", "sensor_id", "sensor_type"),
 }
 _CONTENTS = {
     "images": ("name",),
     "keypoints": ("data", "data"),
     "two_view_geometries": ("data", "data", "qvec", "tvec"),
     "cameras": ("params", "params"),
+    **dict.fromkeys(("rigs", "frames", "frame_data"), ()),
 }
 """Columns whose contents are changed more often than others."""
 _ODD_VALUES = (
@@ -65,6 +69,7 @@ def foreign_version(path, rng):
         *_copied("two_view_geometries", declared, columns),
         *(f"DROP TABLE {table}" for table in _LATER_TABLES[: int(rng.integers(6))]),
         *(["ALTER TABLE images ADD COLUMN from_the_future BLOB"] if rng.random() < 0.3 else []),
+        *(["ALTER TABLE two_view_geometries RENAME TO inlier_matches"] if rng.random() < 0.3 else []),
     )
     return True
 
@@ -139,8 +144,27 @@ def odd_cells(path, rng, tables=_READ_TABLES):
 
 
 def odd_cameras(path, rng):
-    """The same with the intrinsics."""
-    return odd_cells(path, rng, ("cameras",))
+    """The same with the intrinsics, rigs and frames."""
+    return odd_cells(path, rng, ("cameras", "cameras", "rigs", "frames", "frame_data"))
+
+
+def one_place(path, rng):
+    """Put the keypoints of one image, or of all, at one place, perhaps a far one, or on a line."""
+    value, line = pick(rng, (0.0, 100.0, -1e6, 1e15, 3e38)), rng.random() < 0.3
+    rows = _rows(path, "SELECT image_id, rows, cols, data FROM keypoints")
+    for image_id, number, cols, data in rows if rng.random() < 0.3 else [pick(rng, rows)]:
+        changed = np.frombuffer(data, dtype="<f4").reshape(number, cols).copy()
+        changed[:, int(line) : 2] = value
+        set_values(path, "keypoints", "data", changed.tobytes(), f"image_id = {image_id}")
+    return False
+
+
+def unfinished(path, rng):
+    """Leave out what one of COLMAP's steps makes: features, matches, geometries."""
+    tables = ("two_view_geometries", "matches", "keypoints", "cameras", "images")
+    for table in tables[: int(rng.integers(1, 6))]:
+        edit_database(path, "PRAGMA foreign_keys = OFF", f"DELETE FROM {table}")
+    return False
 
 
 def _rows(path, query):
@@ -209,6 +233,6 @@ def companions(path, rng):
 
 
 WAYS = (
-    *(foreign_version, missing_part, impostor, odd_pages, companions),
+    *(foreign_version, missing_part, impostor, odd_pages, companions, one_place, unfinished),
     *(odd_cells, odd_cells, odd_cells, odd_cells, odd_cells),
 )

@@ -5,6 +5,7 @@ left behind gone after the next run.
 """
 
 import argparse
+import itertools
 import os
 import resource
 import shutil
@@ -15,11 +16,12 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 
 from tests.abuse import verdicts
 from tests.abuse.fuzz import caches, command_line, make_base, warm_locate
@@ -31,6 +33,17 @@ _EXTRA_MEMORY = tuple(megabytes * 10**6 for megabytes in (0, 2, 5, 10, 20, 40, 8
 """Bytes by which the address space may grow beyond what the idle process maps."""
 _FILE_SIZES = (0, 8, 100, 1000, 3000, 6000)
 """Bytes that a file may have."""
+_OTHERS = {
+    "synth": ("place/out", "--num-images", "4", "--num-points", "400"),
+    "map": ("database.db", "place/out", "-q"),
+    "join": ("first", "second", "place/out", "--database", "database.db", "-q"),
+    "convert": ("sparse/0", "place/out", "-q"),
+    "convert glb": ("sparse/0", "place/o.glb", "-q"),
+    "convert json": ("sparse/0", "place/o.json", "-q"),
+    "check": ("sparse/0", "--report", "place/o.html", "--no-second-opinion"),
+    "evaluate": ("sparse/0", "truth", "--csv", "place/o.csv"),
+}
+"""Arguments of other commands, which write a folder or a file into `place`."""
 _INTERRUPTED = "sfm-shapefit: interrupted; nothing was written\n"
 _COMPLETE = "sfm-shapefit: interrupted; the output is complete\n"
 
@@ -39,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser):
     parser.add_argument("--moments", type=int, default=50, help="per signal, in a warm process")
     parser.add_argument("--cold", type=int, default=5, help="per signal, in processes of their own")
     parser.add_argument("--rivals", type=int, default=20, help="rounds of two runs into the same place")
+    parser.add_argument("--rooms", type=int, default=5, help="sizes of a place without room, per command")
     parser.add_argument("--seed", type=int, default=0)
 
 
@@ -48,11 +62,16 @@ def run(args):
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         warm, cold = rng.random(args.moments), rng.random(args.cold)
         checks[f"{number.name} at {args.moments} moments"] = partial(signals, number, warm)
+        checks[f"{number.name} at {args.moments} moments, other commands"] = partial(
+            signals_of_others, number, rng.random(args.moments)
+        )
         if args.cold:
             checks[f"{number.name} at {args.cold} moments, cold"] = partial(cold_signals, number, cold)
     checks |= {
         "files that may not grow": partial(starve, resource.RLIMIT_FSIZE, _FILE_SIZES),
         "a full disk": full_disk,
+        "a full disk, other commands": partial(no_room, args.rooms, True),
+        "files that may not grow, other commands": partial(no_room, args.rooms, False),
         "little memory": partial(starve, resource.RLIMIT_AS, _EXTRA_MEMORY),
         f"two runs at once, {args.rivals} times": partial(rivals, args.rivals),
         "a read-only input": read_only_input,
@@ -77,6 +96,12 @@ class Bench:
 
     def __init__(self, work):
         self.base, self.folder = make_base(work / "base"), work / "case"
+        for name, left_out in (("first", (1, 2)), ("second", (5, 6))):
+            half = pycolmap.Reconstruction(self.base / "sparse" / "0")
+            for frame in left_out:
+                half.deregister_frame(frame)
+            (self.base / name).mkdir()
+            half.write(self.base / name)
         self.expected = warm_locate(self.base)["database"]
         self.writable = [self.folder, *caches()]
         self.endings, self.before = Counter(), {}
@@ -89,13 +114,15 @@ class Bench:
         assert outcome.code == 0, outcome.stderr
         return time.perf_counter() - start
 
-    def prepare(self):
-        """Make a fresh folder with the input."""
+    def prepare(self, *names):
+        """Make a fresh folder with the input, and with further parts of the scene."""
         shutil.rmtree(self.folder, ignore_errors=True)
         for name in ("tmp", "place"):
             (self.folder / name).mkdir(parents=True)
         shutil.copytree(self.base / "sparse", self.folder / "sparse")
         shutil.copyfile(self.base / "database.db", self.folder / "database.db")
+        for name in names:
+            shutil.copytree(self.base / name, self.folder / name)
         self.before = fingerprint(self.folder)
 
     def arguments(self, *extra, out="place/out"):
@@ -151,6 +178,58 @@ def signals(number, moments, bench):
         outcome = bench.note(child.finish())
         accepted = {0, -number if number == signal.SIGKILL else 130}
         yield from _after_signal(bench, outcome.code, outcome.stderr, accepted, overwrite=overwrite)
+
+
+def signals_of_others(number, moments, bench):
+    """Send a signal at random moments of other commands, each of which replaces an earlier output or file."""
+    for k, moment in enumerate(moments.tolist()):
+        label = list(_OTHERS)[k % len(_OTHERS)]
+        command, again = (label.split()[0], *_OTHERS[label]), label not in ("synth", "convert")
+        bench.prepare("truth", "first", "second")
+        started = time.perf_counter()
+        if again:
+            run_forked(partial(command_line, command, bench.folder / "tmp"), bench.folder, bench.writable)
+        duration_s = time.perf_counter() - started if again else bench.duration_s
+        inputs = {name: kind for name, kind in fingerprint(bench.folder).items() if name[:5] != "place"}
+        main = partial(command_line, (*command, *["--overwrite"] * again), bench.folder / "tmp")
+        child = start_forked(main, bench.folder, bench.writable)
+        time.sleep(moment * 1.05 * duration_s)
+        os.kill(child.pid, number)
+        outcome = bench.note(child.finish())
+        if outcome.code not in (0, -number if number == signal.SIGKILL else 130):
+            yield f"{label}: exit {outcome.code}, {outcome.stderr[-300:]!r}"
+        if "Traceback" in outcome.stderr:
+            yield f"{label}: {outcome.stderr[-300:]!r}"
+        yield from (f"{label}: {problem}" for problem in _broken_outputs(bench.folder / "place", again))
+        if number == signal.SIGKILL:
+            later = ("convert", "sparse/0", "place/later.csv", "-q")
+            run_forked(partial(command_line, later, bench.folder / "tmp"), bench.folder, bench.writable)
+        after = fingerprint(bench.folder)
+        yield from (f"{label}: changed {name}" for name in inputs if after.get(name) != inputs[name])
+        yield from (f"{label}: left {name}" for name in after if ".partial" in name or name[:4] == "tmp/")
+
+
+def _broken_outputs(place, again):
+    """Yield which outputs or files in a place are lost, or not whole."""
+    found = sorted(path for path in place.iterdir() if not path.name.startswith("."))
+    if again and not found:
+        yield "the earlier output is gone"
+    for path in found:
+        if path.is_dir():
+            models = {file.parent for file in path.rglob("images.bin")}
+            yield from itertools.chain.from_iterable(map(verdicts.faults_of_model, sorted(models)))
+            if again and not any((path / name).exists() for name in ("locate.json", "map.json")):
+                yield f"{path.name} is not whole"
+            continue
+        content = path.read_bytes()
+        whole = {
+            ".html": content.endswith(b"</html>\n"),
+            ".json": content.endswith(b"}\n") or content.endswith(b"}"),
+            ".csv": content.endswith(b"\n") and content.count(b"\n") == 7,
+            ".glb": int.from_bytes(content[8:12], "little") == len(content),
+        }
+        if not whole[path.suffix]:
+            yield f"{path.name} is not whole"
 
 
 def cold_signals(number, moments, bench):
@@ -216,6 +295,49 @@ def full_disk(bench):
                 bench.endings["left out: no file system can be mounted here"] += 1
                 return
             yield from bench.judge(bench.locate("-q"), f"{pages} pages")
+
+
+def no_room(rooms, on_disk, bench):
+    """Other commands in a place without room, or whose files may not grow, also over an earlier output."""
+    for label, arguments in _OTHERS.items():
+        command = (label.split()[0], *arguments)
+        bench.prepare("truth", "first", "second")
+        run_forked(partial(command_line, command, bench.folder / "tmp"), bench.folder, bench.writable)
+        earlier = shutil.copytree(bench.folder / "place", bench.folder.parent / "earlier", dirs_exist_ok=True)
+        size = sum(4096 + path.stat().st_size for path in earlier.rglob("*"))
+        for pages, again in itertools.product((16, 4, 1, 2, 8)[:rooms], (False, True)):
+            if again and label in ("synth", "convert"):  # folders of theirs are never replaced
+                continue
+            bench.prepare("truth", "first", "second")
+            room = pages * 4096 + (size if again and on_disk else 0)
+            with _small_disk(bench.folder / "place", room) if on_disk else nullcontext(True) as mounted:
+                if not mounted:
+                    bench.endings["left out: no file system can be mounted here"] += 1
+                    return
+                if again:
+                    shutil.copytree(earlier, bench.folder / "place", dirs_exist_ok=True)
+                main = partial(_run_limited, None if on_disk else room, (*command, *["--overwrite"] * again))
+                yield from _after_no_room(bench, main, f"{label}, {pages} pages, {again}")
+        shutil.rmtree(earlier)
+
+
+def _run_limited(most_bytes, command):
+    """Be `sfm-shapefit`, whose files may not be larger than so many bytes."""
+    if most_bytes is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+    command_line(command, Path("tmp").absolute())
+
+
+def _after_no_room(bench, main, label):
+    """Run a command: it must succeed, or change nothing and say one sentence that names no private place."""
+    before = fingerprint(bench.folder)
+    code, _, stderr, *_ = bench.note(run_forked(main, bench.folder, bench.writable))
+    if code not in (0, 3) or (code and stderr.count("\n") != 1):
+        yield f"{label}: exit {code}, {stderr[-300:]!r}"
+    if ".partial" in stderr:
+        yield f"{label}: names its private place: {stderr[-300:]!r}"
+    if code and fingerprint(bench.folder) != before:
+        yield f"{label}: failed, and left or changed something"
 
 
 @contextmanager

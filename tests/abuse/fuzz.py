@@ -47,6 +47,10 @@ class Case(NamedTuple):
     """Of the command line, relative to the case's folder."""
     same_answer: bool = False
     """Whether the positions must be those of the sound input, since the damage does not concern them."""
+    may_fail: bool = True
+    """Whether bad input is to be expected."""
+    made: str = ""
+    """File that is made, or replaced, where it is not the third argument."""
 
 
 def add_arguments(parser: argparse.ArgumentParser):
@@ -157,12 +161,16 @@ def caches():
 def _judge(case, outcome, folder, before, expected):
     """Yield what is wrong with what a case left behind."""
     after = fingerprint(folder)
-    yield from (f"changed its input {name}" for name in before if after.get(name) != before[name])
     command, source, target, *_ = (*case.arguments, "")
-    writes = outcome.code == 0 and command in ("locate", "solve", "map", "convert")
-    new = sorted({Path(name).parts[0] for name in after.keys() - before.keys()})
-    if new != ([target] if writes else []):
-        yield f"left {', '.join(new) or 'nothing'} behind"
+    writes = outcome.code == 0 and (case.made or command in ("locate", "solve", "map", "convert"))
+    target = case.made or target
+    kept = [name for name in before if not (writes and name == case.made)]
+    yield from (f"changed its input {name}" for name in kept if after.get(name) != before[name])
+    if outcome.code == 3 and not case.may_fail:
+        yield f"stopped by what it need not use: {outcome.stderr[:300]!r}"
+    new = {Path(name).parts[0] for name in after.keys() - before.keys()}
+    if new != ({target} if writes and target not in before else set()):
+        yield f"left {', '.join(sorted(new)) or 'nothing'} behind"
     yield from (f"left {name} behind" for name in after if name.startswith("tmp/"))
     if writes and (folder / target).is_dir():
         for written in sorted((folder / target).glob("*/")) if command == "map" else [folder / target]:
@@ -214,6 +222,66 @@ def _database(base, folder, rng):
     same = way(folder / "database.db", rng)
     arguments = _choose_command("sparse/0", rng, database=True, locate_only=same)
     return Case(f"database: {way.__name__}", arguments, same_answer=same)
+
+
+def _found(base, folder, rng):
+    """A damaged database beside a sound model, which nobody asked for."""
+    _copy(base, folder, "sparse/0", "database.db", "truth")
+    way = pick(rng, (*databases.WAYS, *[databases.odd_cameras] * 3))
+    way(folder / "database.db", rng)
+    command = pick(rng, (("locate", "sparse/0", "out"), ("check", "sparse/0"), ("inspect", "sparse/0")))
+    return Case(f"found: {way.__name__}", command, may_fail=False)
+
+
+def _outputs(base, folder, rng):
+    """A file to be made where an input, a link, a folder or something odd is."""
+    _copy(base, folder, "sparse/0", "database.db", "truth", "priors.txt")
+    earlier = pick(rng, ("earlier.csv", "earlier.glb", "earlier.html"))
+    (folder / earlier).write_text("of before")
+    (folder / "loop").symlink_to("loop")
+    (folder / "nowhere").symlink_to("gone/away")
+    (folder / "link").symlink_to("sparse")
+    os.link(folder / "sparse/0/points3D.bin", folder / "hard.bin")
+    os.mkfifo(folder / "fifo")
+    target = pick(
+        rng,
+        (
+            *(
+                "new.csv",
+                "new",
+                "sparse/0/images.bin",
+                "link/0/cameras.bin",
+                "hard.bin",
+                "database.db",
+                earlier,
+            ),
+            *(
+                "database.db-wal",
+                "database.db-journal",
+                "priors.txt",
+                "truth",
+                "loop",
+                "nowhere",
+                "fifo",
+                ".",
+            ),
+            *("sparse/0/../0/points3D.bin", "gone/new.csv", "/dev/null", "/dev/full", "", "n" * 300, "a\0b"),
+        ),
+    )
+    if "\0" in target:  # which no command line has
+        target = "caf\udce9.csv"
+    how = ("--overwrite",) if rng.random() < 0.7 else ()
+    kinds = ("csv", "tum", "nerf", "glb", "ply")
+    command = pick(
+        rng,
+        (
+            ("convert", "sparse/0", target, "--format", pick(rng, kinds), "-q"),
+            ("check", "sparse/0", "--report", target, "-q", *["--no-second-opinion"] * (rng.random() < 0.7)),
+            ("check", "sparse/0", "--database", "database.db", "--report", target, "-q"),
+            ("evaluate", "sparse/0", "truth", "--csv", target),
+        ),
+    )
+    return Case(f"outputs: {command[0]} {how}", (*command, *how), made=target)
 
 
 def _map(base, folder, rng):
@@ -287,5 +355,5 @@ def _place(base, folder, rng):
 
 _KINDS = (
     *(_binary, _binary, _binary, _text, _text, _records, _database, _database, _database, _map, _map),
-    *(_graph, _graph, _table, _foreign, _names, _place),
+    *(_graph, _graph, _table, _foreign, _names, _place, _found, _found, _outputs, _outputs),
 )

@@ -131,9 +131,12 @@ def _limit():
 
 
 def _loads_kernel():
-    """Return whether a compiled kernel is loaded from its cache, which unpickles what it wrote itself."""
-    frame = sys._getframe()
-    while frame is not None and not frame.f_code.co_filename.endswith("kernel_cache.py"):
+    """Return whether a compiled kernel is loaded from its cache, or returns an array.
+
+    Either unpickles what it wrote itself: numba, the class of the array that it makes first.
+    """
+    frame, doors = sys._getframe(), ("kernel_cache.py", os.path.join("numba", "core", "serialize.py"))
+    while frame is not None and not frame.f_code.co_filename.endswith(doors):
         frame = frame.f_back
     return frame is not None
 

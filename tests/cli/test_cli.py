@@ -299,10 +299,16 @@ def broken_scenes(folder: Path):
 
     yield "missing folder", [folder / "nowhere"], 3, "nowhere"
     yield "cut file", [scene("cut", cut)], 3, "images.bin"
-    yield "no pairs", [scene("pairless", no_pairs)], 4, "matches"
-    yield "only watermark pairs", [scene("watermark", unusable_pairs)], 4, "matches"
-    yield "database of another scene", [scene("other", other_scene)], 3, "not in the model"
-    yield "database is no database", [scene("text", no_database)], 3, "database"
+
+    def named(name, damage):
+        model = scene(name, damage)
+        return [model, "--database", model.parents[1] / "database.db"]
+
+    yield "no pairs", named("pairless", no_pairs), 4, "matches but no two-view geometries"
+    yield "only watermark pairs", named("watermark", unusable_pairs), 4, "16 pairs WATERMARK"
+    yield "no features", named("bare", sql("DELETE FROM keypoints")), 3, "no features were extracted"
+    yield "database of another scene", named("other", other_scene), 3, "not in the model"
+    yield "database is no database", named("text", no_database), 3, "database"
     missing = folder / "missing.db"
     yield "database missing", [RING_MODEL, "--database", missing], 3, "missing.db"
 

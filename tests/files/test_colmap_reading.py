@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 import struct
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -700,25 +701,27 @@ def test_images_that_only_one_side_has_are_named_or_skipped_and_none_in_common_i
 GEOMETRY, KEYPOINTS = "UPDATE two_view_geometries SET ", "UPDATE keypoints SET "
 FIRST = f" WHERE pair_id = {pair_id(1, 2)}"
 BROKEN_ROWS = {
-    "short matches": (f"{GEOMETRY} data = x'00' {FIRST}", "pair camera.* and camera.* has matches of wrong"),
-    "no matches": (f"{GEOMETRY} data = NULL", "matches of wrong length"),
+    "no matches": (f"{GEOMETRY} data = NULL", "has matches of wrong length; 15 of 15 pairs"),
+    "empty matches": (f"{GEOMETRY} data = x''", "has matches of wrong length; 15 of 15 pairs"),
     "three columns": (f"{GEOMETRY} cols = 3", "matches of wrong length"),
     "huge rows": (f"{GEOMETRY} rows = {2**62}", "matches of wrong length"),
-    "rows as text": (f"{GEOMETRY} rows = 'many'", "pair 2147483649 is damaged"),
-    "negative pair": (f"{GEOMETRY} pair_id = -pair_id", "pair -.* is damaged"),
-    "unknown image": (f"{GEOMETRY} pair_id = {pair_id(1, 77)} {FIRST}", "joins the images with ids 1 and 77"),
-    "own image": (f"{GEOMETRY} pair_id = {pair_id(2, 2)} {FIRST}", "joins the images with ids 2 and 2"),
+    "negative rows": (f"{GEOMETRY} rows = -1", "matches of wrong length"),
+    "rows as text": (f"{GEOMETRY} rows = 'many'", "pair camera.* has no number where one belongs"),
+    "negative pair": (f"{GEOMETRY} pair_id = -pair_id", r"the pair with id -\d+ is of no two images"),
+    "no such configuration": (f"{GEOMETRY} config = 77", "has the unknown configuration 77"),
+    "two of fifteen": (f"{GEOMETRY} cols = 3 WHERE pair_id < {pair_id(1, 4)}", r"2 of 15 pairs \(13%\)"),
     "few keypoints": (
         f"{KEYPOINTS} rows = 3, data = substr(data, 1, 72) WHERE image_id = 2",
         "has matches of keypoints that do not exist",
     ),
-    "no keypoints": ("DELETE FROM keypoints", "has matches of keypoints that do not exist"),
+    "no keypoints": ("DELETE FROM keypoints", "no features were extracted of its 6 images"),
     "short keypoints": ("UPDATE keypoints SET data = substr(data, 2)", "keypoints of image .* are damaged"),
     "three per keypoint": ("UPDATE keypoints SET cols = 3, rows = rows * 2", "keypoints of image .* are dam"),
     "NaN keypoint": (f"{KEYPOINTS} data = CAST(x'0000c07f' || substr(data, 5) AS BLOB)", "not finite"),
     "signaling NaN": (f"{KEYPOINTS} data = CAST(x'0100807f' || substr(data, 5) AS BLOB)", "not finite"),
     "no table": ("DROP TABLE keypoints", "has no table keypoints"),
-    "no column": ("ALTER TABLE two_view_geometries DROP COLUMN config", "no column config in its table two_"),
+    "no geometries": ("DROP TABLE two_view_geometries", "has no table two_view_geometries"),
+    "no column": ("ALTER TABLE two_view_geometries DROP COLUMN data", "no column data in its table two_"),
     "no images": ("DELETE FROM images", "has no images"),
     "no name": ("UPDATE images SET name = NULL WHERE image_id = 3", "id 3 has no valid id and name"),
     "bad id": (f"UPDATE images SET image_id = {MAX_NUM_IMAGES} WHERE image_id = 3", "no valid id and name"),
@@ -731,6 +734,105 @@ def test_a_broken_row_is_named(path, model, case):
     with pytest.raises(InputError, match=message) as caught:
         read_all(edit_database(path, statement), model)
     assert str(path) in str(caught.value)
+
+
+ONE_BROKEN_ROW = {
+    "short matches": (
+        f"{GEOMETRY} data = x'00' {FIRST}",
+        "1 of 15 pairs (the pair {0} and {1} has matches of",
+    ),
+    "rows as text": (
+        f"{GEOMETRY} rows = 'many' {FIRST}",
+        "1 of 15 pairs (the pair {0} and {1} has no number",
+    ),
+    "unknown image": (f"{GEOMETRY} pair_id = {pair_id(1, 77)} {FIRST}", "1 of 15 pairs (the pair with id"),
+    "own image": (
+        f"{GEOMETRY} pair_id = {pair_id(2, 2)} {FIRST}",
+        "1 of 15 pairs (the pair {1} and {1} is of",
+    ),
+    "configuration": (f"{GEOMETRY} config = 77 {FIRST}", "1 of 15 pairs (the pair {0} and {1} has the unkn"),
+}
+"""What is done to the pair of the first two images, and what is told of it."""
+
+
+@pytest.mark.parametrize("case", ONE_BROKEN_ROW)
+def test_one_broken_row_costs_its_pair_and_is_told_once(path, model, case):
+    whole = read_all(path, model)
+    statement, told = ONE_BROKEN_ROW[case]
+    edit_database(path, statement)
+    with view_of(path, model.images) as view:
+        assert as_sets(view.batches()) == {pair: found for pair, found in whole.items() if pair != (0, 1)}
+        (note,) = view.matches.notes
+    assert told.format(*model.images.names) in note
+
+
+def test_one_match_of_a_missing_keypoint_costs_that_match(path, model):
+    whole = read_all(path, model)
+
+    def change(connection):
+        add_pair(connection, 1, 2, [*sorted(whole[0, 1])[1:], (0, 10**6)])
+
+    with view_of(edit_database(path, change), model.images) as view:
+        found = as_sets(view.batches())
+        (note,) = view.matches.notes
+    assert found == whole | {(0, 1): whole[0, 1] - {min(whole[0, 1])}}
+    assert f"1 of {sum(map(len, whole.values()))} matches (the pair {model.images.names[0]} and" in note
+
+
+@pytest.mark.parametrize("bits", ["0000c07f", "0100807f", "0000807f"])  # quiet and signaling NaN, infinity
+def test_one_keypoint_that_is_not_finite_costs_its_matches(path, model, bits):
+    whole = read_all(path, model)
+    edit_database(path, f"{KEYPOINTS} data = CAST(x'{bits}' || substr(data, 5) AS BLOB) WHERE image_id = 2")
+    with view_of(path, model.images) as view:
+        found = as_sets(view.batches())
+        (note,) = view.matches.notes
+        assert np.isfinite(view.keypoints(1)).all()
+        assert view.keypoints(1)[0].tolist() == [0.0, 0.0]
+        for part in view.parts(50):  # other processes leave the same aside
+            with part.open() as opened:
+                assert found.items() >= as_sets(opened.batches()).items()
+    lost = {
+        pair: {match for match in found if match[pair.index(1)] == 0}
+        for pair, found in whole.items()
+        if 1 in pair
+    }
+    assert any(lost.values())
+    assert found == {pair: matches - lost.get(pair, set()) for pair, matches in whole.items()}
+    assert f"keypoints (image {model.images.names[1]} has a keypoint that is not finite)" in note
+
+
+def test_one_image_whose_keypoints_cannot_be_read_is_as_if_it_had_none(path, model):
+    whole = read_all(path, model)
+    edit_database(path, f"{KEYPOINTS} data = substr(data, 2) WHERE image_id = 3")
+    with view_of(path, model.images) as view:
+        assert as_sets(view.batches()) == {pair: found for pair, found in whole.items() if 2 not in pair}
+        assert len(view.keypoints(2)) == 0
+        (note,) = view.matches.notes
+    assert f"1 of 6 images (the keypoints of image {model.images.names[2]} are damaged)" in note
+
+
+def as_old(connection, *, config=True):
+    """Make the schema of COLMAP 3.1 and before: inlier_matches in the place of two_view_geometries."""
+    columns = "pair_id, rows, cols, data" + ", config" * config
+    connection.execute(
+        "CREATE TABLE inlier_matches (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, "
+        f"cols INTEGER NOT NULL, data BLOB{', config INTEGER NOT NULL' * config})"
+    )
+    connection.execute(f"INSERT INTO inlier_matches SELECT {columns} FROM two_view_geometries")
+
+
+@pytest.mark.parametrize("config", [True, False])
+@pytest.mark.parametrize("newer", ["DROP TABLE two_view_geometries", "DELETE FROM two_view_geometries"])
+def test_verified_matches_of_an_old_colmap_are_read(path, model, config, newer):
+    whole = read_all(path, model)
+    edit_database(path, partial(as_old, config=config), newer)
+    assert read_all(path, model) == whole
+
+
+def test_the_newer_table_of_verified_matches_goes_before_the_older(path, model):
+    whole = read_all(path, model)
+    edit_database(path, as_old, f"DELETE FROM two_view_geometries {FIRST}")
+    assert read_all(path, model) == {pair: found for pair, found in whole.items() if pair != (0, 1)}
 
 
 def test_files_that_are_no_database_are_refused(model, tmp_path):

@@ -18,12 +18,20 @@ DAMAGED = [
     ("UPDATE cameras SET camera_id = 4294967295", "camera with id 4294967295 is damaged"),
     (UNTYPED.format("cameras") + "INSERT INTO cameras SELECT * FROM cameras", "camera 1 stands twice"),
     (UNTYPED.format("images") + "INSERT INTO images SELECT * FROM images", "id 1 stands twice"),
-    (UNTYPED.format("images") + "UPDATE images SET camera_id = 'x'", "no valid name and camera"),
+    (UNTYPED.format("images") + "UPDATE images SET camera_id = 'x'", "has 'x' for the number camera_id"),
+    (UNTYPED.format("cameras") + "UPDATE cameras SET width = 'x'", "has 'x' for the number width"),
+    (
+        UNTYPED.format("cameras") + "UPDATE cameras SET prior_focal_length = x'00'",
+        r"has b'\\x00' for the number prior_focal_length",
+    ),
+    ("UPDATE images SET name = CAST(x'ff41' AS TEXT) WHERE image_id = 2", r"'\\udcffA' .* is no UTF-8"),
     (ENDLESS, "its cameras is a view"),
     ("UPDATE images SET camera_id = 7 WHERE image_id = 2", "id 2 has no valid name and camera"),
     ("DELETE FROM images", "has 0 images, but two or more"),
 ]
 DAMAGED_RIGS = [
+    (UNTYPED.format("rigs") + "UPDATE rigs SET rig_id = 'x'", "has 'x' for the number rig_id"),
+    (UNTYPED.format("frame_data") + "UPDATE frame_data SET data_id = 'x'", "has 'x' for the number data_id"),
     ("UPDATE rig_sensors SET sensor_from_rig = x'00'", "the pose of a sensor in rig 1 is damaged"),
     ("UPDATE rig_sensors SET sensor_id = 99 WHERE sensor_id = 3", "rig 1 refers to camera 99"),
     ("UPDATE rigs SET ref_sensor_id = 77 WHERE rig_id = 1", "rig 1 refers to camera 77"),

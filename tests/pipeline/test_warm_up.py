@@ -62,13 +62,22 @@ def test_processes_that_die_are_told_of(monkeypatch):
     assert done == WarmUp(0, ("find_pieces, place_graph: no process is left to run it",))
 
 
+def test_what_a_process_that_is_killed_at_work_leaves_goes(tmp_path, monkeypatch):
+    monkeypatch.setattr(module.tempfile, "tempdir", str(tmp_path))
+    heard = module._run(["find_pieces"], 1)
+    next(heard)
+    assert list(tmp_path.glob("*/find_pieces"))
+    heard.close()
+    assert not list(tmp_path.iterdir())
+
+
 def test_processes_look_for_garbage_as_often_as_the_one_that_began_them(monkeypatch):
     thresholds = []
     monkeypatch.setattr(module.gc, "set_threshold", lambda *given: thresholds.append(given))
     monkeypatch.setattr(module.signal, "signal", lambda *_: None)
     ours, theirs = Pipe()
     ours.send("")
-    module._work(theirs, (50_000, 20, 100))
+    module._work(theirs, "", (50_000, 20, 100))
     assert thresholds == [(50_000, 20, 100)]
 
 

@@ -4,30 +4,39 @@ How the file is opened stands in `sqlite_file`, which pairs it has in `database_
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array, rows_taken
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.database_pairs import PairRows, check_schema, match_names, read_pairs
+from sfm_shapefit.files.colmap.damage import Damage
+from sfm_shapefit.files.colmap.database_pairs import (
+    PairRows,
+    check_schema,
+    match_names,
+    pair_table,
+    read_pairs,
+    refuse_no_features,
+)
 from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.sorted_matches import MOST_MATCHES, SortedMatches
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_beside, is_blob
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
-from sfm_shapefit.scene.matches import Matches, Reading, View
+from sfm_shapefit.scene.matches import Matches, Reading, View, batch_ranges
 
 PIXEL_BYTES, MOST_KEYPOINTS = 8, 10_000_000
 """Bytes of a keypoint that is kept, and keypoints of a database up to which they are: a run looks at each a
 dozen times."""
 
 _HALF = np.uint64(32)  # bits of a keypoint's number; a match is one number of two of them
+_SURVEYED = 250_000  # matches that are looked at together; as many as are read together later
 
 
 def find_database(model_folder: Path) -> Path | None:
@@ -36,14 +45,22 @@ def find_database(model_folder: Path) -> Path | None:
     return next(filter(None, map(database_beside, (folder, *folder.parents[:2]))), None)
 
 
-def open_database(path: Path | str, names: Sequence[str], rows: PairRows | None = None) -> "DatabaseMatches":
+def open_database(path: Path | str, names: Sequence[str], sound: "Sound | None" = None) -> "DatabaseMatches":
     """Open a COLMAP database for the matches between images of some names; see `DatabaseMatches`."""
     file = DatabaseFile(path)
     try:
-        return DatabaseMatches(file, names, rows)
+        return DatabaseMatches(file, names, sound)
     except BaseException:
         file.close()
         raise
+
+
+class Sound(NamedTuple):
+    """What of a database can be used."""
+
+    rows: PairRows
+    broken: Mapping[str, IntArray]
+    """Keypoints that are not finite, of the images that have some."""
 
 
 class DatabaseMatches(Matches):
@@ -53,21 +70,22 @@ class DatabaseMatches(Matches):
     numbers.
     """
 
-    def __init__(self, file: DatabaseFile, names: Sequence[str], rows: PairRows | None = None) -> None:
-        """Read which pairs the database has.
+    def __init__(self, file: DatabaseFile, names: Sequence[str], sound: Sound | None = None) -> None:
+        """Read which pairs the database has, and look at all that is to be read of it.
 
         Args:
-            file: the database, which is closed with these.
+            file: the database, which is closed with these; what is left aside as damaged is noted there.
             names: of the images, ascending.
-            rows: the pairs between them, where they are known; then the table of all is not read.
+            sound: what of it can be used, where that is known; then nothing is looked at.
 
         Raises:
-            InputError: if it is no COLMAP database, or has fewer than two of the images; later reads raise
-                it for damaged rows, naming image or pair.
+            InputError: if it is no COLMAP database, has fewer than two of the images, or is too damaged; the
+                first row that is damaged is named.
         """
         super().__init__()
-        self.file, self.names = file, tuple(names)
+        self.file, self.names, self.notes = file, tuple(names), file.notes
         check_schema(file)
+        self._table = pair_table(file)
         index_of_id = match_names(file, names)
         self._ids = {self.names[index]: i for i, index in index_of_id.items() if index >= 0}
         self.missing_names = tuple(name for name in names if name not in self._ids)
@@ -76,15 +94,49 @@ class DatabaseMatches(Matches):
         self.num_keypoints = np.array([counts.get(self._ids.get(name), 0) for name in names], dtype=np.int64)
         self.total_keypoints = sum(counts.values())
         self._pixels: dict[str, npt.NDArray[np.float32]] = {}
-        self.rows = read_pairs(file, index_of_id) if rows is None else rows
-        self.pairs, self.num_matches = self.rows.pairs, self.rows.num_inliers
+        self._broken = {} if sound is None else {**sound.broken}
+        self._num_wrong, self._first_wrong = 0, -1
+        damage = Damage(file)
+        rows = self._readable_pairs(index_of_id, damage) if sound is None else sound.rows
+        self.rows, self.pairs, self.num_matches = rows, rows.pairs, rows.num_inliers
         is_kept = float(self.num_matches.sum(dtype=np.float64)) <= MOST_MATCHES
         self._sorted = SortedMatches(self.num_matches) if is_kept else None
+        if sound is None:
+            self._survey(damage)
+            damage.tell()
 
-    @property
-    def notes(self) -> Sequence[str]:
-        """What was read otherwise than it stands in the file, a sentence each."""
-        return self.file.notes
+    def _readable_pairs(self, index_of_id: dict[int, int], damage: Damage) -> PairRows:
+        """Return the pairs of images whose keypoints can be read; others have none from now on."""
+        rows = read_pairs(self.file, index_of_id, damage)
+        if len(rows.pairs):
+            refuse_no_features(self.file)
+        query = (
+            "SELECT image_id FROM keypoints WHERE typeof(rows) != 'integer' OR rows != 0 AND "
+            "(rows < 0 OR cols NOT IN (2, 4, 6) OR typeof(data) != 'blob' OR length(data) != 4 * rows * cols)"
+        )
+        unreadable = {row[0] for row in self.file.query(query)}
+        is_lost = np.array([self._ids.get(name, -1) in unreadable for name in self.names], dtype=np.bool_)
+        self.num_keypoints[is_lost] = 0
+        is_empty = self.num_keypoints == 0
+        lost = np.flatnonzero(is_lost | (is_empty & np.isin(np.arange(len(self.names)), rows.pairs)))
+        first = f"the keypoints of image {self.names[lost[0]]} are damaged" if len(lost) else ""
+        damage.leave_aside(len(lost), len(self.names), "images", first)
+        return rows_taken(rows, ~is_empty[rows.pairs].any(axis=1))
+
+    def _survey(self, damage: Damage) -> None:
+        """Look for keypoints that are not finite, and matches of those that do not exist; all is kept."""
+        for image in np.flatnonzero(self.num_keypoints).tolist():
+            self._stored_pixels(self.names[image])
+        broken, first = sum(map(len, self._broken.values())), ""
+        if broken:
+            first = f"image {next(iter(self._broken))} has a keypoint that is not finite"
+        damage.leave_aside(broken, int(self.num_keypoints.sum()), "keypoints", first)
+        for begin, end in batch_ranges(self.num_matches, _SURVEYED):
+            self.read(np.arange(begin, end), keep=True)
+        if self._num_wrong:
+            names = " and ".join(self.names[image] for image in self.pairs[self._first_wrong])
+            first = f"the pair {names} has matches of keypoints that do not exist"
+        damage.leave_aside(self._num_wrong, int(self.num_matches.sum()), "matches", first)
 
     def close(self) -> None:
         """Close the database."""
@@ -97,31 +149,31 @@ class DatabaseMatches(Matches):
             self._sorted.clear()
 
     def keypoints(self, name: str) -> FloatArray:
-        """Return the pixels (k, 2) of the keypoints of an image."""
-        if name not in self._pixels:
-            pixels = self._read_keypoints(name)
-            if self.total_keypoints > MOST_KEYPOINTS:
-                return pixels.astype(np.float64)
+        """Return the pixels (k, 2) of the keypoints of an image; zeros for one that is not finite."""
+        return self._stored_pixels(name).astype(np.float64)
+
+    def _stored_pixels(self, name: str) -> npt.NDArray[np.float32]:
+        """Return the same in the precision of the file; what is read is kept, unless it is very much."""
+        if name in self._pixels:
+            return self._pixels[name]
+        pixels = self._read_keypoints(name)
+        if self.total_keypoints <= MOST_KEYPOINTS:
             self._pixels[name] = pixels
-        return self._pixels[name].astype(np.float64)
+        return pixels
 
     def _read_keypoints(self, name: str) -> npt.NDArray[np.float32]:
-        """Return the pixels (k, 2) of the keypoints of an image as the file has them."""
+        """Return the same from the file."""
         query = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
         found = self.file.query(query, self._ids[name]) if name in self._ids else []
-        if not found or not found[0][0]:
-            return np.zeros((0, 2), dtype=np.float32)
-        rows, cols, data = found[0]
+        rows, cols, data = found[0] if found else (0, 0, b"")
         if cols not in (2, 4, 6) or not is_blob(data, rows, cols, itemsize=4):
-            raise InputError(
-                f"{self.file.path}: the keypoints of image {name} are damaged; extract them again"
-            )
+            return np.zeros((0, 2), dtype=np.float32)  # what is damaged was told when the file was opened
         xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float32)
-        if np.isfinite(xy).all():
-            return xy
-        raise InputError(
-            f"{self.file.path}: image {name} has a keypoint that is not finite; extract them again"
-        )
+        is_finite = np.isfinite(xy).all(axis=1)
+        if not is_finite.all():
+            self._broken[name] = np.flatnonzero(~is_finite)
+            xy[~is_finite] = 0.0
+        return xy
 
     def rays(self, lens: Lens, pixels: FloatArray) -> FloatArray:
         """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for those without."""
@@ -152,10 +204,17 @@ class DatabaseMatches(Matches):
         if not new.all():
             of_pair, both = of_pair[new], both[new]
         matches = both.astype("<u8", copy=False).view("<u4").reshape(-1, 2)[:, ::-1]
-        missing = np.flatnonzero((matches >= self.num_keypoints[self.pairs[chosen]][of_pair]).any(axis=1))
-        if len(missing):
-            pair = int(chosen[of_pair[missing[0]]])
-            raise self.damaged_pair(pair, "matches of keypoints that do not exist")
+        ends = self.pairs[chosen][of_pair]
+        is_lost = (matches >= self.num_keypoints[ends]).any(axis=1)
+        if is_lost.any():
+            self._num_wrong += int(is_lost.sum())
+            self._first_wrong = (
+                int(chosen[of_pair[is_lost][0]]) if self._first_wrong < 0 else self._first_wrong
+            )
+        for image in map(self.names.index, self._broken):
+            is_lost |= ((ends == image) & np.isin(matches, self._broken[self.names[image]])).any(axis=1)
+        if is_lost.any():
+            of_pair, matches = of_pair[~is_lost], matches[~is_lost]
         return np.bincount(of_pair, minlength=len(chosen)), matches
 
     def _stored_matches(self, chosen: IntArray) -> bytes:
@@ -172,7 +231,9 @@ class DatabaseMatches(Matches):
         return [
             DatabasePart(
                 path=path,
-                rows=rows_taken(self.rows, view.rows[part])._replace(pairs=view.pairs[part]),
+                sound=Sound(
+                    rows_taken(self.rows, view.rows[part])._replace(pairs=view.pairs[part]), self._broken
+                ),
                 images=images,
             )
             for part in ranges
@@ -180,7 +241,7 @@ class DatabaseMatches(Matches):
 
     def look_up(self, pairs: IntArray, columns: str) -> list[tuple[Any, ...]]:
         """Return columns of the two-view geometries of pairs."""
-        return self.file.look_up("two_view_geometries", columns, self.rows.rowids[pairs].tolist())
+        return self.file.look_up(self._table, columns, self.rows.rowids[pairs].tolist())
 
     def damaged_pair(self, pair: int, what: str) -> InputError:
         """Return the error that names a pair of images."""
@@ -194,7 +255,7 @@ class DatabasePart:
 
     path: Path
     """Absolute path of the database; it must be the same for all workers."""
-    rows: PairRows
+    sound: Sound
     """Where in it the pairs are: to find that out anew takes longer, the more pairs the database has."""
     images: Images
     """All images of the view, to which pairs refer: without rotations and cameras matches are no rays."""
@@ -202,10 +263,10 @@ class DatabasePart:
     @property
     def num_pairs(self) -> int:
         """Number of pairs."""
-        return len(self.rows.pairs)
+        return len(self.sound.rows.pairs)
 
     @contextmanager
     def open(self) -> Iterator[View]:
         """Open the database again, for these pairs alone, nothing of which is kept."""
-        with closing(open_database(self.path, self.images.names, self.rows)) as matches:
+        with closing(open_database(self.path, self.images.names, self.sound)) as matches:
             yield matches.at(self.images, reading=Reading(keeps=False))

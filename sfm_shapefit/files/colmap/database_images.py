@@ -14,7 +14,7 @@ import pycolmap
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
-from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
+from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID, refuse_no_features
 from sfm_shapefit.files.colmap.database_rigs import DatabaseRigs, read_rigs
 from sfm_shapefit.files.colmap.images import bytes_of_name, images_of, sensors_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
@@ -83,6 +83,7 @@ def read_images(file: DatabaseFile) -> UnposedImages:
             lost.setdefault(camera_id, []).append(name)
             continue
         if not (is_sound and is_between(camera_id, 0, NO_ID) and model.exists_camera(camera_id)):
+            refuse_no_features(file)
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid name and camera; it is damaged"
             )

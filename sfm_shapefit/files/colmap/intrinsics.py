@@ -144,7 +144,10 @@ def _read_tables(database: DatabaseFile, left_out: PairNames) -> dict[str, Rows]
     Images of cameras that cannot be, and their pairs, are none of these.
     """
     most = _MOST_PAIRS + len(left_out)
-    which = f"WHERE F IS NOT NULL AND length(F) = 72 ORDER BY rows DESC, pair_id LIMIT {most}"
+    is_whole = (
+        "typeof(F) = 'blob' AND length(F) = 72 AND typeof(pair_id) = 'integer' AND typeof(rows) = 'integer'"
+    )
+    which = f"WHERE {is_whole} ORDER BY rows DESC, pair_id LIMIT {most}"
     found = {
         table: database.rows(table, {columns: f"SELECT {', '.join(columns)} FROM {table} {chosen}"})
         for table, columns, chosen in (

@@ -33,6 +33,18 @@ _LOCK_TIMEOUT_S = 2.0  # seconds; another program that writes is waited for so l
 _AT_ONCE = 500  # rows that are looked up by one statement; four times faster than one by one
 _COPY_ATTEMPTS = 3  # copies; a file that changes during each of them is in use
 
+_MOST_SHOWN = 40  # letters of a wrong value in a message; a blob may have millions
+_NUMBERS = {
+    "cameras": frozenset({"camera_id", "model", "width", "height", "prior_focal_length"}),
+    "images": frozenset({"image_id", "camera_id"}),
+    "rigs": frozenset({"rig_id", "ref_sensor_id", "ref_sensor_type"}),
+    "rig_sensors": frozenset({"rig_id", "sensor_id", "sensor_type"}),
+    "frames": frozenset({"frame_id", "rig_id"}),
+    "frame_data": frozenset({"frame_id", "data_id", "sensor_id", "sensor_type"}),
+    "pose_priors": frozenset({"image_id", "corr_data_id", "corr_sensor_type", "coordinate_system"}),
+}
+"""Columns that hold numbers; those of pairs and keypoints are looked at row by row."""
+
 # A database may come from anywhere: what no query of ours needs is not allowed.
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_LENGTH: 2**29,  # bytes of a value or a row; 20 million keypoints, 67 million matches
@@ -119,10 +131,12 @@ class DatabaseFile:
             queries: what to select, by the columns of `table` that it needs.
 
         Raises:
-            InputError: as `query`, and if rows of the table, or of images, which queries join, are computed.
+            InputError: as `query`, and if rows of the table, or of images, which queries join, are computed
+                or have text in the place of a number.
         """
         for stored in (table, "images"):
             self.refuse_computed(stored)
+            self.refuse_mistyped(stored)
         columns = self.columns(table)
         return next(
             (self.query(query) for needed, query in queries.items() if columns.issuperset(needed)), []
@@ -144,6 +158,17 @@ class DatabaseFile:
         hidden = self.query("SELECT name FROM pragma_table_xinfo(?) WHERE hidden != 0", table)
         if hidden:
             raise InputError(f"{what} has a computed column {hidden[0][0]!r}")
+
+    def refuse_mistyped(self, table: str) -> None:
+        """Refuse text and blobs where numbers belong: sqlite takes any type in the place of any other."""
+        for column in sorted(self.columns(table) & _NUMBERS.get(table, frozenset())):
+            is_wrong = f"typeof({column}) IN ('text', 'blob')"
+            if wrong := self.query(f"SELECT {column} FROM {table} WHERE {is_wrong} LIMIT 1"):
+                shown = repr(wrong[0][0])[:_MOST_SHOWN]
+                raise InputError(
+                    f"{self.path} is damaged: its table {table} has {shown} for the number {column}; extract "
+                    "features again"
+                )
 
 
 @contextmanager
