@@ -38,6 +38,8 @@ _MODELS = {
     "fisheye": "OPENCV_FISHEYE",
     "simple_radial": "OPENCV",
     "radial": "OPENCV",
+    "spherical": "EQUIRECTANGULAR",
+    "equirectangular": "EQUIRECTANGULAR",  # its name in early versions
 }
 """COLMAP's name of a camera model, by OpenSfM's."""
 
@@ -134,6 +136,8 @@ def _lens(node: JsonNode, camera_id: int) -> Lens:
     width, height = node.get("width").integer(), node.get("height").integer()
     if width < 1 or height < 1:
         raise node.error("has no size")
+    if _MODELS[kind] == "EQUIRECTANGULAR":
+        return Lens(_MODELS[kind], (float(width), float(height)), id=camera_id, width=width, height=height)
     size = float(max(width, height))
 
     def value(key: str) -> float:

@@ -19,6 +19,7 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import PARTS, Lens, Origin
 from sfm_shapefit.scene.matches import PairNames
 
+_ALIKE = 1.03  # factor; within, pairs tell no more than the fundamental matrices of all
 _UNLIKE = 1.1  # factor; pairs that agree scatter by a third of that
 _MOST_OFF = 4.0  # factor; a view graph that wants a larger one says more of itself than of the lens
 
@@ -47,9 +48,10 @@ def settle_intrinsics(
     by_pairs = read_pair_focals(file, asked, left_out) if file is not None and asked else {}
     if file is not None and guessed and wanted != "held":
         by_database = calibrate_view_graph(file, asked, left_out)
-        by_database |= {
-            i: one.factor for i, one in by_pairs.items() if one.is_one_sided or i not in by_database
-        }
+        for i, one in by_pairs.items():
+            known = by_database.get(i)
+            if known is None or (one.is_one_sided and not 1.0 / _ALIKE < one.factor / known < _ALIKE):
+                by_database[i] = one.factor
         for k, found in guessed.items():
             factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
         factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0

@@ -90,12 +90,19 @@ def test_distortion_is_taken_over_in_colmaps_order(tmp_path):
     np.testing.assert_allclose(lens.parameters, expected, rtol=1e-15)
 
 
+@pytest.mark.parametrize("kind", ["spherical", "equirectangular"])
+def test_a_panorama_of_opensfm_is_equirectangular(tmp_path, kind):
+    camera = {"projection_type": kind, "width": 1200, "height": 600}
+    (lens,) = read_opensfm(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": camera}}])).images.lenses
+    assert (lens.model, lens.parameters) == ("EQUIRECTANGULAR", (1200.0, 600.0))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ('"focal": 1.0', '"fokal": 1.0', r"\[0\]/cameras/c has no key 'focal'"),
         ('"focal": 1.0', '"focal": NaN', r"\[0\]/cameras/c/focal is not finite"),
-        ('"perspective"', '"spherical"', r"projection type 'spherical'; perspective, brown"),
+        ('"perspective"', '"dual"', r"projection type 'dual'; perspective, brown"),
         ('"camera": "c"', '"camera": "d"', r"shots/a\.jpg has the camera 'd'"),
         ('"width": 100', '"width": "wide"', r"cameras/c/width is no number"),
         ('"shots"', "shots", r"line 1, column \d+: no JSON"),
