@@ -39,7 +39,7 @@ def settle_intrinsics(
     guessed = {} if file is None else find_uncalibrated(file, images, listed)
     lenses, factors = list(images.lenses), np.ones(len(images.lenses))
     if wanted not in ("auto", "held"):
-        lenses = [lens.in_doubt(Origin.CALIBRATION) for lens in lenses]
+        lenses = [lens if lens.is_panorama else lens.in_doubt(Origin.CALIBRATION) for lens in lenses]
     for k in (k for k, lens in enumerate(images.lenses) if lens.id in listed):
         lenses[k] = images.lenses[k].in_doubt(Origin.GUESS)
     for k, found in guessed.items():
