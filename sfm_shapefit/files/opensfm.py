@@ -40,7 +40,7 @@ _MODELS = {
     "simple_radial": "OPENCV",
     "radial": "OPENCV",
     "spherical": "EQUIRECTANGULAR",
-    "equirectangular": "EQUIRECTANGULAR",
+    "equirectangular": "EQUIRECTANGULAR",  # its name in early versions
 }
 """COLMAP's name of a camera model, by OpenSfM's."""
 
@@ -138,7 +138,7 @@ def _lens(node: JsonNode, camera_id: int) -> Lens:
     if width < 1 or height < 1:
         raise node.error("has no size")
     if _MODELS[kind] == "EQUIRECTANGULAR":
-        return Lens(_MODELS[kind], (width, height), id=camera_id, width=width, height=height)
+        return Lens(_MODELS[kind], (float(width), float(height)), id=camera_id, width=width, height=height)
     size = float(max(width, height))
 
     def value(key: str) -> float:

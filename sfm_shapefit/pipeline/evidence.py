@@ -75,7 +75,13 @@ def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:
 
 
 def _ask_some(images: Images, asked: BoolArray | None) -> BoolArray | None:
-    """Return which images (i,) are asked for their focal length: of a lens that took very many, only some."""
+    """Return which images (i,) are asked for their focal length: of a lens that took very many, only some.
+
+    Panoramas have none.
+    """
+    panoramas = np.array([lens.is_panorama for lens in images.lenses], dtype=np.bool_)[images.lens_of]
+    if panoramas.any():
+        asked = ~panoramas if asked is None else asked & ~panoramas
     every = np.bincount(images.lens_of[images.is_posed])
     if every.max(initial=0) <= _MOST_ASKED:
         return asked

@@ -16,6 +16,7 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import PARTS, Lens, Origin
 from sfm_shapefit.scene.matches import PairNames
 
+_ALIKE = 1.03  # factor; within, pairs tell no more than the fundamental matrices of all
 _UNLIKE = 1.1  # factor; pairs that agree scatter by a third of that
 _MOST_OFF = 4.0  # factor; a view graph that wants a larger one says more of itself than of the lens
 
@@ -35,7 +36,7 @@ def settle_intrinsics(
     guessed = {} if file is None else find_uncalibrated(file, images, listed)
     lenses, factors = list(images.lenses), np.ones(len(images.lenses))
     if wanted not in ("auto", "held"):
-        lenses = [lens.in_doubt(Origin.CALIBRATION) for lens in lenses]
+        lenses = [lens if lens.is_panorama else lens.in_doubt(Origin.CALIBRATION) for lens in lenses]
     for k in (k for k, lens in enumerate(images.lenses) if lens.id in listed):
         lenses[k] = images.lenses[k].in_doubt(Origin.GUESS)
     for k, found in guessed.items():
@@ -47,9 +48,10 @@ def settle_intrinsics(
         by_rays = doubted & [lens.is_adjustable and not lens.is_plane for lens in lenses]
         others = [found.database_id for k, found in guessed.items() if not by_rays[k]]
         by_database = calibrate_view_graph(file, others, left_out) if others else {}
-        by_database |= {
-            i: one.factor for i, one in by_pairs.items() if one.is_one_sided or i not in by_database
-        }
+        for i, one in by_pairs.items():
+            known = by_database.get(i)
+            if known is None or (one.is_one_sided and not 1.0 / _ALIKE < one.factor / known < _ALIKE):
+                by_database[i] = one.factor
         for k, found in guessed.items():
             factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
         factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0

@@ -96,6 +96,13 @@ def test_distortion_is_taken_over_in_colmaps_order(tmp_path):
     assert (lens.model, lens.parameters) == ("EQUIRECTANGULAR", (200, 100))
 
 
+@pytest.mark.parametrize("kind", ["spherical", "equirectangular"])
+def test_a_panorama_of_opensfm_is_equirectangular(tmp_path, kind):
+    camera = {"projection_type": kind, "width": 1200, "height": 600}
+    (lens,) = read_opensfm(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": camera}}])).images.lenses
+    assert (lens.model, lens.parameters) == ("EQUIRECTANGULAR", (1200.0, 600.0))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

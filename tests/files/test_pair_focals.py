@@ -1,11 +1,16 @@
 """Focal lengths that COLMAP keeps with the pairs it verified: what agrees starts guessed lenses."""
 
+from contextlib import closing
+
 import numpy as np
 import pycolmap
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.pair_focals import read_pair_focals
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.pipeline import intrinsics
 from tests.lens_scene import camera_of_model, write_scene
 from tests.scenes import edit_database, read_from
 
@@ -66,3 +71,17 @@ def test_map_starts_from_them_and_tells_where_a_guess_that_is_held_contradicts_t
     assert not found.warnings
     held = sfm_shapefit.map_database(scene[0], intrinsics="held", min_trust=0.0)
     assert any("of camera 2 with 50" in w and "not 768" in w for w in held.warnings)
+
+
+def test_they_outweigh_the_view_graph_where_they_differ_from_it_by_more_than_their_scatter(
+    scene, monkeypatch
+):
+    with_lenses_of_pairs(scene[0], lambda _: 500.0)
+    asked = {2: 600.0, 4: 510.0}  # of camera 6 the view graph says nothing
+    monkeypatch.setattr(
+        intrinsics, "calibrate_view_graph", lambda *_: {i: px / GUESS_PX for i, px in asked.items()}
+    )
+    with closing(DatabaseFile(scene[0])) as file:
+        images, _ = intrinsics.settle_intrinsics(read_images(file).images, file, "auto")
+    found = [lens.focal_px for lens in images.lenses if lens.id in GUESSED]
+    assert found == pytest.approx([500.0, 510.0, 500.0])
