@@ -206,7 +206,7 @@ def test_few_priors_are_fitted_by_least_squares_and_none_is_called_wrong(count, 
         np.testing.assert_allclose(gauge.apply(t), best.apply(t), atol=1e-9)
         assert gauge.axes is not None
         assert gauge.warning == ""
-        assert f"{count} do not check one another" in gauge.statement
+        assert f"{count}, too few to check one another" in gauge.statement
         none = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3))
         assert not len(compare_with_priors(gauge.apply(t), np.zeros(len(t)), priors, *none).wrong)
 
