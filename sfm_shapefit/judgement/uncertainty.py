@@ -66,7 +66,7 @@ class CameraUncertainty:
     gauge: BoolArray
     """(n,) the nodes whose centroid and scale are held fixed."""
     scale_sigma: float = np.inf
-    """Relative standard deviation of the scale that offsets in rigid groups tell; infinite without any."""
+    """Relative standard deviation of the scale by offsets in rigid groups; infinite without any."""
 
     @property
     def sigmas(self) -> FloatArray:

@@ -68,7 +68,7 @@ class Assessment(CameraTrust):
     cameras held fixed; of infinite diagonal for nodes outside the largest rigid piece of the inlier pairs;
     NaN, all of them, where the graph is too large for its factor."""
     scale_sigma: float | None = None
-    """Relative standard deviation of the scale that offsets in rigid groups tell, if it is above a tenth."""
+    """Relative standard deviation of the scale by offsets in rigid groups, if it is above a tenth."""
     doubts: Doubts | None = None
     """What the pairs' own rotations say of those given; None if they were not asked."""
 
@@ -137,8 +137,8 @@ class Hold(NamedTuple):
     """(m,)"""
     conditioning: Conditioning
     scale_sigma: float
-    """Relative standard deviation of the scale that the offsets inside rigid groups tell, infinite where they
-    tell none."""
+    """Relative standard deviation of the scale by the offsets in rigid groups, infinite where these leave it
+    open."""
 
 
 def find_hold(

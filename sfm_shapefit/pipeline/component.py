@@ -21,7 +21,7 @@ from sfm_shapefit.pipeline.inputs import MatchSource, see_matches
 from sfm_shapefit.pipeline.map_run import MapRun
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.settle import settle
-from sfm_shapefit.placement.gauge import FEWEST_PRIORS, UselessPriorsError
+from sfm_shapefit.placement.gauge import UselessPriorsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.sequences import Visit
@@ -132,8 +132,7 @@ def _with_told(run: MapRun, given: Given, members: IntArray) -> Given:
     """Return what is known of a component's images with what the user told of them."""
     names, known = set(given.images.names), run.known.of(members)
     if known.priors is not None:  # without notes: the run says them once
-        priors = replace(known.priors, notes=()) if len(known.priors) >= FEWEST_PRIORS else None
-        known = replace(known, priors=priors)
+        known = replace(known, priors=replace(known.priors, notes=()) if len(known.priors) else None)
     distances = tuple(one for one in run.options.gauge.known_distance if {*one[:2]} <= names)
     return given._replace(distances=distances, known=known)
 

@@ -399,7 +399,11 @@ def _prior_statement(fit: PriorMotion, *, turns: bool) -> str:
     axes = "axes: the input's"
     if turns:
         axes = f"turned by {float(rotation_angles_deg(fit.motion.rotation)):.1f} deg onto theirs"
-    agree = f"{agreeing} of {count} agree" if count >= FEWEST_CHECKED else f"{count} do not check one another"
+    agree = (
+        f"{agreeing} of {count} agree"
+        if count >= FEWEST_CHECKED
+        else f"{count}, too few to check one another"
+    )
     return f"{agree}, to {fit.level:.3g} per axis; origin: theirs, {axes}"
 
 
@@ -418,5 +422,5 @@ def _prior_warning(
         return ""
     few = "the position priors lie on a line" if on_line else "the position priors are fewer than three"
     if turns:
-        return f"{few}, so the model is turned onto that line, and about it by any angle"
+        return f"{few}, so the model is turned onto their line, and about it by any angle"
     return f"{few}, so the axes are kept as the input has them; they need not be those of the priors"

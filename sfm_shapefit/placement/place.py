@@ -294,8 +294,9 @@ def refuse_without_triangle(measured: MeasuredGraph, pieces: list[RigidPiece]) -
         against = () if measured.evidence is None else measured.evidence.contradicting
         if len(against) > num_edges:
             cure = f"{len(against)} pairs contradict the rotations: these are wrong, or of another scene"
-        one = "cameras" if measured.groups is None else "frames"
-        raise UnsolvableError(f"the {num_edges} usable directions tie no three {one} to one another; {cure}")
+        raise UnsolvableError(
+            f"the {num_edges} usable directions tie no three cameras to one another; {cure}"
+        )
 
 
 def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:

@@ -29,8 +29,9 @@ def compare_with_priors(
 ) -> PriorFit:
     """Return how well priors fit cameras that stand in the priors' axes.
 
-    A prior is off by its own standard deviation, or by the level of all, whichever is larger. Of five right
-    ones without a standard deviation one is called wrong in 7 of 100 draws, of eight in less than one.
+    A prior is off by its own standard deviation, or by the level of all, whichever is larger. Where
+    none has a standard deviation, one of five right ones is called wrong in 7 of 100 draws, of eight in less
+    than one.
 
     Args:
         centers: (n, 3) of all cameras in the output; NaN for those that are not in it.

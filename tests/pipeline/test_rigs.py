@@ -205,14 +205,15 @@ def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace
     ]
 
 
-def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
+def test_rigs_whose_sensors_coincide_are_no_yardstick(rigs, tmp_path):
     write_workspace(rigs, tmp_path / "w", WorkspaceOptions(database=False))
     model = pycolmap.Reconstruction(tmp_path / "w" / "sparse" / "0")
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(pose.rotation, np.zeros(3)))
-    with pytest.raises(UnsolvableError, match="nothing determines the scale"):
-        sfm_shapefit.locate(model, points="never")
+    found = sfm_shapefit.locate(model, points="never", adjust="none", min_trust=0.0)
+    assert found.placement.unit is None
+    assert found.gauge.scale == "input"
 
 
 @pytest.fixture
@@ -289,7 +290,7 @@ def test_a_placement_with_loose_cameras_stays_where_points_determine_none(monkey
 
     monkeypatch.setattr(rigs_stage, "place_pieces", place_pieces)
     monkeypatch.setattr(rigs_stage, "_count_held", lambda *_: 0)
-    measured = SimpleNamespace(groups=[], num_points=9, without_points=lambda: "without points")
+    measured = SimpleNamespace(has_scale=True, num_points=9, without_points=lambda: "without points")
     assert list(rigs_stage.place_cameras(measured, PlacementOptions(), NodeOptions(), Clock())) == [loose]
 
 
@@ -518,3 +519,33 @@ def test_models_with_rigs_are_joined_at_the_scale_that_they_have(rigs, workspace
         InputError, match="model 1 has rigs of several cameras, and a scale by that, but model 0"
     ):
         sfm_shapefit.join([alone, whole])
+
+
+@pytest.mark.parametrize(
+    "told", [{"scale": "unit"}, {"known_distance": (("0001.jpg", "0004.jpg", 2.0),)}, {}]
+)
+def test_the_offset_of_an_imu_is_in_the_unit_of_the_output(told):
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    imu, before = pycolmap.sensor_t(type=pycolmap.SensorType.IMU, id=1), [0.1, 0.02, 0.0]
+    for rig in model.rigs.values():
+        rig.add_sensor(imu, pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array(before)))
+    found = sfm_shapefit.locate(model, RING / "database.db", **told).reconstruction
+    scale = fit_similarity(centers_of(model), centers_of(found)).scale
+    own = [rig.sensor_from_rig(imu).translation for rig in found.rigs.values()]
+    expected = np.multiply(before, scale if told else 1.0)
+    np.testing.assert_allclose(own, np.broadcast_to(expected, (len(own), 3)), rtol=1e-3 if told else 0.0)
+
+
+def test_priors_turn_and_shift_a_model_whose_rigs_tell_the_scale(rigs, workspace, tmp_path):
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    where = rigs.centers @ turn.T + [450.0, 5200.0, 400.0]
+    names = read_model(workspace / "truth").images.names
+    table = tmp_path / "priors.txt"
+    rows = zip(names[::3], where[::3].tolist(), strict=True)
+    table.write_text("".join(f"{name} {x} {y} {z}\n" for name, (x, y, z) in rows))
+    found = sfm_shapefit.locate(workspace / "sparse" / "0", priors=table)
+    assert found.gauge.scale == "rig"
+    assert "agree" in found.gauge.statement
+    own = centers_of(found.reconstruction)
+    assert np.median(np.linalg.norm(own - where, axis=1)) < 0.02  # as the scale to a thousandth, over 20
+    assert np.nanmax(found.prior_fit.off) < 0.2

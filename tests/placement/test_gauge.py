@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit import InputError, locate
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import Similarity, compose, invert, median_spread, normalized
+from sfm_shapefit.base.geometry import Similarity, compose, fit_similarity, invert, median_spread, normalized
 from sfm_shapefit.facts.warnings import prior_warnings
 from sfm_shapefit.files.colmap.geodesy import datum_of, enu_of
 from sfm_shapefit.files.colmap.model import read_model
@@ -29,6 +29,7 @@ from sfm_shapefit.placement.gauge import (
     input_gauge,
     metric_gauge,
     moved_gauge,
+    moved_to_priors,
     prior_gauge,
     unit_gauge,
 )
@@ -191,6 +192,58 @@ def test_exact_priors_give_back_scale_axes_and_origin_and_on_a_line_the_axes_sta
     assert gauge.axes is None
     assert "lie on a line" in gauge.warning
     assert gauge.similarity.scale == pytest.approx(3.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.02])
+@pytest.mark.parametrize("count", [3, 4])
+def test_few_priors_are_fitted_by_least_squares_and_none_is_called_wrong(count, sigma):
+    """Seven unknowns leave a median of residuals nothing to tell noise by."""
+    for seed in range(20):
+        rng = np.random.default_rng(300 + seed)
+        t = cameras(seed)
+        measured = 5.0 * t @ TURN.T + sigma * rng.standard_normal(t.shape)
+        priors = made_priors(measured, rows=np.arange(count))
+        gauge = prior_gauge(t, priors)
+        best = fit_similarity(t[:count], measured[:count])
+        np.testing.assert_allclose(gauge.apply(t), best.apply(t), atol=1e-9)
+        assert gauge.axes is not None
+        assert gauge.warning == ""
+        assert f"{count}, too few to check one another" in gauge.statement
+        none = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3))
+        assert not len(compare_with_priors(gauge.apply(t), np.zeros(len(t)), priors, *none).wrong)
+
+
+@pytest.mark.parametrize("count", [5, 6, 8])
+def test_one_wrong_prior_of_five_or_more_is_named_and_has_no_part(count):
+    for seed in range(10):
+        rng = np.random.default_rng(400 + seed)
+        t = cameras(seed)
+        truth = 5.0 * t @ TURN.T
+        measured = truth + 0.02 * rng.standard_normal(t.shape)
+        measured[1] += [3.0, -2.0, 2.0]
+        priors = made_priors(measured, rows=np.arange(count))
+        placed = prior_gauge(t, priors).apply(t)
+        assert np.median(np.linalg.norm(placed - truth, axis=1)) < 5 * 0.02  # by 4 right ones of 12 - 7
+        none = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3))
+        assert compare_with_priors(placed, np.zeros(len(t)), priors, *none).wrong[0] == 1
+
+
+def test_where_the_scale_is_known_priors_give_turn_and_shift_as_far_as_they_tell_them():
+    t = cameras(3)
+    known = distance_gauge(t, np.array([[0, 1]]), 2.0 * np.linalg.norm(t[:1] - t[1:2], axis=1), ["a, b"])
+    truth = 2.0 * t @ TURN.T + [100.0, -20.0, 3.0]
+    for rows, apart in ((np.arange(12), 1.001), (np.arange(3), 1.0)):
+        gauge = moved_to_priors(known, t, made_priors(apart * truth, rows=rows))
+        assert gauge.similarity.scale == known.similarity.scale
+        assert gauge.scale == "distance"
+        assert gauge.statement.startswith("distance: a, b are")
+        moved, there = gauge.apply(t)[rows], apart * truth[rows]
+        np.testing.assert_allclose(moved.mean(axis=0), there.mean(axis=0), atol=0.02)
+        np.testing.assert_allclose(gauge.axes, TURN, atol=1e-6)
+    one = moved_to_priors(known, t, made_priors(truth, rows=[4]))
+    np.testing.assert_allclose(one.apply(t)[4], truth[4], atol=1e-12)
+    assert one.axes is None
+    assert "fewer than three" in one.warning
 
 
 def test_where_axes_mean_nothing_priors_on_a_line_turn_the_model_onto_it():

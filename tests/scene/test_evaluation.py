@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.scene.evaluation import RELATIVE_THRESHOLDS, evaluate_poses
+from sfm_shapefit.base.geometry import fit_similarity
+from sfm_shapefit.scene.evaluation import RELATIVE_THRESHOLDS, evaluate_poses, evaluate_positions
 from tests.problems import random_rotations, turn
 
 
@@ -47,9 +48,27 @@ def test_the_same_cameras_in_another_world_have_no_error(seed, n):
     assert found.position.max < 1e-10
     assert found.rotation_deg.max < 1e-11
     assert all(r.recall == 1.0 for r in found.recalls)
-    assert found.warnings == ()
+    assert len(found.warnings) == (n < 5)
     np.testing.assert_allclose(found.aligned_centers, reference.centers, atol=1e-10)
     np.testing.assert_allclose(found.rotation_ref_from_model, found.ref_from_model.rotation, atol=1e-10)
+
+
+@pytest.mark.parametrize("n", [3, 4])
+def test_few_cameras_are_aligned_by_least_squares_and_it_is_said_what_that_takes_up(n):
+    reference = scene(6, n)
+    rng = np.random.default_rng(7)
+    moved = replace(reference, centers=reference.centers + 0.1 * rng.normal(size=(n, 3)))
+    found = evaluate_poses(moved, reference)
+    best = fit_similarity(moved.centers, reference.centers).apply(moved.centers) - reference.centers
+    np.testing.assert_allclose(found.position_errors, np.linalg.norm(best, axis=1), atol=1e-12)
+    assert found.position.median > 0.01  # none is 0, as none is fitted exactly
+    assert f"takes up 7 of their {3 * n} coordinates" in found.warnings[0]
+    positions = evaluate_positions(
+        (moved.names, moved.centers), (reference.names, reference.centers), "this", as_they_stand=False
+    )
+    assert positions.statement.startswith(f"this; the alignment of {n} cameras")
+    with pytest.raises(InputError, match="leaves two without errors"):
+        evaluate_poses(moved, scene(6, 2))
 
 
 def test_one_moved_camera_has_exactly_its_own_error_in_the_references_units_and_its_row():
