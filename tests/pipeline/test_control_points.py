@@ -1,5 +1,7 @@
 """Ground control points set scale, origin and axes; what is wrong with them is said."""
 
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -10,7 +12,8 @@ from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.files.colmap.control_points import read_control_points
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.known import read_known
-from sfm_shapefit.placement.control_points import fit_control_points
+from sfm_shapefit.placement.control_points import control_gauge, fit_control_points
+from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.scene.given import ControlPoints
 from tests.models import write_priors
 from tests.scenes import RING
@@ -244,3 +247,28 @@ def test_wrong_points_have_no_part_in_the_fit(count):
             assert fit.sigma == pytest.approx(0.02, rel=4.0 / np.sqrt(2 * freedom))
     assert found_all == 3
     assert sum(lost) <= 1
+
+
+def test_where_the_scale_is_known_control_points_turn_and_shift():
+    rng = np.random.default_rng(8)
+    found = rng.uniform(-10.0, 10.0, (6, 3))
+    positions = 1.01 * replace(WORLD, scale=1.0).apply(found)
+    none = np.zeros(0, dtype=np.int64)
+    known = ControlPoints(
+        names=tuple("abcdef"),
+        positions=positions,
+        is_check=np.zeros(6, dtype=np.bool_),
+        points=none,
+        images=none,
+        pixels=np.zeros((0, 2)),
+        statement="",
+    )
+    fit = fit_control_points(known, found, resize=False)
+    assert fit.motion.scale == 1.0
+    np.testing.assert_allclose(fit.motion.rotation, WORLD.rotation, atol=1e-9)
+    np.testing.assert_allclose(fit.residuals.mean(axis=0), 0.0, atol=1e-9)
+    rigs = Gauge(similarity=fit.motion, scale="rig", statement="rig: x; y", scale_statement="rig: x")
+    gauge = control_gauge(rigs, known, fit, resize=False)
+    assert gauge.scale == "rig"
+    assert gauge.statement.startswith("rig: x; control points: ")
+    assert gauge.statement.endswith("; origin and axes: theirs")
