@@ -168,3 +168,19 @@ def test_a_database_called_colmap_is_found_beside_the_model(tmp_path: Path) -> N
     (folder / "database.db").rename(folder / "colmap.db")
     assert str(locate(folder / MODEL).inputs.database) == str(folder / "colmap.db")
     assert "colmap.db; 0 of 16" in run("map", folder, tmp_path / "mapped", code=0).stdout
+
+
+def test_poses_serve_with_a_database_where_all_tracks_name_the_first_keypoint(tmp_path: Path) -> None:
+    whole = map_database(RING / "database.db").models[0].reconstruction
+    whole.write_text(tmp_path)
+    plain = locate(tmp_path, RING / "database.db")
+    file = tmp_path / "points3D.txt"
+    lines = [line for line in file.read_text().splitlines() if not line.startswith("#")]
+    heads = [line.split()[:8] for line in lines]
+    tracks = [[f"{image} 0" for image in line.split()[8::2]] for line in lines]
+    file.write_text("\n".join(" ".join([*head, *track]) for head, track in zip(heads, tracks, strict=True)))
+    found = locate(tmp_path, RING / "database.db")
+    assert np.array_equal(found.placed.centers, plain.placed.centers)
+    assert any("keypoint 0 of image" in warning and "left aside" in warning for warning in found.warnings)
+    assert run("convert", tmp_path, tmp_path / "poses.tum", code=0).exit_code == 0
+    assert "left aside, poses alone are read" in run("locate", tmp_path, tmp_path / "out", code=4).stderr
