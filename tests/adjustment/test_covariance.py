@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_shapefit.adjustment import covariance
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.gauge import free_similarities, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.solve import adjust, linearize_all, values_of
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.adjustment.made import observed, ring_problem
@@ -142,3 +144,9 @@ def test_centers_relative_to_frames_that_are_told_are_known_relative_to_these():
     np.testing.assert_array_equal(found.deciding, deciding)
     sizes = np.einsum("naa->n", found.centers)
     assert sizes[deciding].max() < sizes[~deciding].min()
+
+
+@pytest.mark.parametrize("motions", [np.zeros((4, 6, 7)), np.full((4, 6, 7), np.nan)])
+def test_nodes_that_do_not_tell_the_motions_are_no_gauge(motions):
+    with pytest.raises(UnsolvableError, match="do not stand apart"):
+        covariance._dual(motions, np.arange(4))

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.scene import describe_line, describe_loops
 from sfm_shapefit.files.colmap.merge import merge_models
@@ -552,3 +552,21 @@ def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path
     facts = json.loads(run(*arguments, "--overwrite", "--join", "never", "--json", "--priors", table).stdout)
     assert facts["joins"] == []
     assert not (out / "joined_0").exists()
+
+
+@pytest.mark.parametrize(("image", "value"), [(1, -1e6), (3, 100.0), (None, 100.0)])
+def test_keypoints_that_are_all_at_one_place_cost_their_image_alone(tmp_path, image, value):
+    def put(connection):
+        for number, rows, cols in connection.execute("SELECT image_id, rows, cols FROM keypoints").fetchall():
+            data = np.full((rows, cols), value, dtype="<f4").tobytes()
+            if image in (None, number):
+                connection.execute("UPDATE keypoints SET data = ? WHERE image_id = ?", (data, number))
+
+    path = edit_database(copied(RING, tmp_path) / "database.db", put)
+    if image is None:
+        with pytest.raises(UnsolvableError):
+            sfm_shapefit.map_database(path)
+        return
+    mapped = sfm_shapefit.map_database(path)
+    assert mapped.num_placed == 7
+    assert [row.name for row in mapped.models[0].located.cameras if not row.placed] == [f"{image:04}.jpg"]
