@@ -31,7 +31,7 @@ class CameraIntrinsics(Record):
     origin: Annotated[str, "Origin of the given parameters: a guess, EXIF data, or a calibration."]
     decided_by: Annotated[
         How,
-        "What decided about its focal length: the adjustments; the fundamental matrices alone; nothing, as "
+        "What decided about its focal length: the adjustments; pairs of images alone; nothing, as "
         "the matches leave it undetermined, so that it stays as given and only the distortion may change; "
         "or the options, which hold it, or its model, whose intrinsics are not adjusted here.",
     ]
