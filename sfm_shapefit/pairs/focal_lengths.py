@@ -7,6 +7,7 @@ smaller steps from the best of it. Lenses of one model, size and guess are off b
 """
 
 from collections import defaultdict
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,15 @@ _NARROWER = (0.5, 0.25, 0.125)  # steps from the best of these, in theirs; an ad
 # Steps from the best, from which on focal lengths are to explain less of the matches, and by which share of
 # all: through a fisheye .2 less, through a lens that hardly bends .03; chance makes less than .01.
 _APART, _LEAST_GAIN = 4, 0.02
+# Share of matches that a lens of the right bend explains at least, and first coefficients to be tried where
+# none is reached: lenses of these models may be guessed planes and be fisheyes.
+_FITS = 0.5
+_BENDS = {
+    "FOV": (0.5, 1.0, 1.5),
+    "SIMPLE_DIVISION": (-0.1, -0.3),
+    "DIVISION": (-0.1, -0.3),
+    "EUCM": (0.4, 0.7),
+}
 _MOST_KINDS = 8  # kinds of lenses, those of most images; each takes a second
 # Pairs of a kind, evenly of all by their matches; pairs of the most matches alone are of neighbors, which say
 # little. Pairs of few matches fit any focal length, and of very many a part does.
@@ -41,8 +51,8 @@ class _PixelMatches(NamedTuple):
     """(k, 2) rows of the lenses of both images."""
 
 
-def find_focal_factors(view: View, asked: BoolArray, doubted: BoolArray) -> dict[int, float]:
-    """Return by which factors matches want focal lengths longer, by lens; nothing of those left open.
+def find_lenses(view: View, asked: BoolArray, doubted: BoolArray) -> dict[int, Lens]:
+    """Return lenses with the focal lengths that matches want, by row; nothing of those left open.
 
     Args:
         view: of images in axes of their cameras.
@@ -54,12 +64,20 @@ def find_focal_factors(view: View, asked: BoolArray, doubted: BoolArray) -> dict
     for k in np.flatnonzero(asked).tolist():
         lens = images.lenses[k]
         kinds[lens.model, lens.width, lens.height, lens.parameters].append(k)
-    factors: dict[int, float] = {}
+    found: dict[int, Lens] = {}
     for rows in sorted(kinds.values(), key=lambda rows: (-num_images[rows].sum(), rows))[:_MOST_KINDS]:
         own = np.isin(np.arange(len(asked)), rows)
-        factor = _find_factor(_choose_matches(view, own, own | ~doubted), images.lenses, own)
-        factors |= dict.fromkeys(rows, factor) if factor is not None else {}
-    return factors
+        matches, share = _choose_matches(view, own, own | ~doubted), -1.0
+        start = images.lenses[rows[0]]
+        for lens in (start, *(start.bent(bend) for bend in _BENDS.get(start.model, ()))):
+            tried = tuple(lens if is_own else other for other, is_own in zip(images.lenses, own, strict=True))
+            factor, best = _find_factor(matches, tried, own)
+            if factor is not None and best > share:
+                share, parameters = best, lens.longer(factor).parameters
+                found |= {k: replace(images.lenses[k], parameters=parameters) for k in rows}
+            if best >= _FITS:
+                break
+    return found
 
 
 def _choose_matches(view: View, own: BoolArray, known: BoolArray) -> _PixelMatches:
@@ -81,21 +99,23 @@ def _choose_matches(view: View, own: BoolArray, known: BoolArray) -> _PixelMatch
     return _PixelMatches(offsets, np.concatenate(pixels), view.images.lens_of[np.concatenate(pairs)])
 
 
-def _find_factor(matches: _PixelMatches, lenses: tuple[Lens, ...], own: BoolArray) -> float | None:
-    """Return the factor at which the matches fit best; None if they do not determine one."""
+def _find_factor(
+    matches: _PixelMatches, lenses: tuple[Lens, ...], own: BoolArray
+) -> tuple[float | None, float]:
+    """Return the factor at which the matches fit best, None if they do not determine one, and their share."""
     fits = [_fit(matches, lenses, own, factor) for factor in _FACTORS.tolist() if len(matches.pixels)]
     shares = np.array([share for share, _ in fits])
     best = int(np.argmax(shares)) if fits else 0
     is_apart = np.abs(np.arange(len(fits)) - best) >= _APART
     if not _APART <= best < len(fits) - _APART or shares[best] < shares[is_apart].max() + _LEAST_GAIN:
-        return None
+        return None, float(shares.max(initial=0.0))
     factor, (share, found) = float(_FACTORS[best]), fits[best]
     for part in _NARROWER:
         for tried in (factor / _STEP**part, factor * _STEP**part):
             again, there = _fit(matches, lenses, own, tried, found)
             if again > share:
                 factor, share, found = tried, again, there
-    return factor
+    return factor, share
 
 
 def _fit(

@@ -1,6 +1,7 @@
 """Which intrinsics are in doubt, and the focal lengths of them that the view graph knows beforehand."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.intrinsics import Uncalibrated, calibrate_view_graph, find_uncalibrated
 from sfm_shapefit.files.colmap.pair_focals import PairFocal, read_pair_focals
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.pairs.focal_lengths import find_focal_factors
+from sfm_shapefit.pairs.focal_lengths import find_lenses
 from sfm_shapefit.scene.freedom import PARTS_FREED, IntrinsicsFreedom
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import PARTS, Lens, Origin
@@ -57,8 +58,9 @@ def settle_intrinsics(
         factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
         if by_rays.any():
             view = DatabaseMatches(file, images.names).at(images.apart(), left_out)
-            for k, factor in find_focal_factors(view, by_rays, doubted).items():
-                factors[k] = factor
+            for k, seen in find_lenses(view, by_rays, doubted).items():
+                factors[k] = seen.focal_px / images.lenses[k].focal_px
+                lenses[k] = replace(lenses[k], parameters=seen.longer(1.0 / factors[k]).parameters)
     may_move = [[lens.origin is not None and lens.is_adjustable] for lens in lenses]
     by_view_graph = factors != 1.0
     for k in np.flatnonzero(by_view_graph).tolist():

@@ -169,6 +169,13 @@ class Lens:
             return _LENS_MODELS[self.model].num_focal
         return 0 if self.is_panorama else 2 - self.model.startswith(_ONE_FOCAL_LENGTH)
 
+    def bent(self, coefficient: float) -> "Lens":
+        """Return the lens with another first coefficient."""
+        first = self._num_focal + 2
+        return replace(
+            self, parameters=(*self.parameters[:first], coefficient, *self.parameters[first + 1 :])
+        )
+
     def longer(self, factor: float) -> "Lens":
         """Return the lens with focal lengths that are some factor larger."""
         count = self._num_focal

@@ -10,7 +10,7 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.database_images import read_images
-from sfm_shapefit.pairs.focal_lengths import find_focal_factors
+from sfm_shapefit.pairs.focal_lengths import find_lenses
 from sfm_shapefit.scene import lens as lens_module
 from tests.adjustment.made import look_at
 from tests.scenes import read_from, view_of
@@ -81,7 +81,8 @@ def factors_of(path):
     """The factors by which the matches of a database want its one lens longer."""
     images = read_from(path, read_images).images.apart()
     with view_of(path, images) as view:
-        return find_focal_factors(view, np.ones(1, dtype=np.bool_), np.ones(1, dtype=np.bool_))
+        found = find_lenses(view, np.ones(1, dtype=np.bool_), np.ones(1, dtype=np.bool_))
+    return {k: lens.focal_px / images.lenses[k].focal_px for k, lens in found.items()}
 
 
 def test_factors_are_those_of_the_matches_and_a_flat_scene_tells_none(tmp_path):
