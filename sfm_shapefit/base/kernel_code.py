@@ -35,6 +35,7 @@ class LoadedLibrary(JITCodeLibrary):  # type: ignore[misc]
         library = cls.__new__(cls)
         CodeLibrary.__init__(library, codegen, name)  # numba's own sets up a module to compile
         library._linking_libraries, library._shared_module, library._finalized = [], None, True
+        library._reload_init = set()  # which numba before 0.68 does not make there
         engine = codegen._engine._ee
         engine.add_object_file(llvm.ObjectFileRef.from_data(machine_code))
         engine.finalize_object()
