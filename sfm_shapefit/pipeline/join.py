@@ -147,7 +147,10 @@ def _without_foreign(inputs: Inputs, names: Sequence[str]) -> Inputs:
     shared, path = "images that the models share", inputs.database
     if path is None:
         return replace(inputs, statement=shared)
-    missing = _missing(path, names)
+    try:
+        missing = _missing(path, names)
+    except InputError as error:
+        return replace(inputs, database=None, statement=f"{shared}; the database beside the first: {error}")
     if not missing:
         return inputs
     told = f"{shared}; {path}, found beside the first, lacks {len(missing)} of {len(names)} images"
