@@ -6,7 +6,7 @@ models and matches -> ties between pieces -> votes, program, refinement, judgeme
 
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,7 +115,9 @@ def _read(
     found = [*map(read_model, models)]
     every = {name for model in found for name in model.images.names}
     # A database that has all of them, each under its own name, says that they are different images.
-    are_different = database is not None and not _missing(database, every)
+    are_different = False
+    with suppress(InputError):  # of one that cannot be used is said later
+        are_different = database is not None and not _missing(database, every)
     for number, (source, model) in enumerate(zip(models, found, strict=True)):
         label = str(source) if isinstance(source, Path | str) else f"model {number}"
         names = dict.fromkeys(name for piece in pieces for name in piece.model.images.names)

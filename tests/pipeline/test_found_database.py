@@ -79,7 +79,7 @@ def test_a_database_that_is_named_and_cannot_be_used_is_refused(scene, tmp_path,
         assert told in run_refused(*command, "--database", path, code=code)
 
 
-@pytest.mark.parametrize("how", [*UNUSABLE.keys() - {"another scene", "text", "no image"}])
+@pytest.mark.parametrize("how", sorted(UNUSABLE.keys() - {"another scene", "text", "no image"}))
 def test_map_says_what_a_database_lacks(scene, tmp_path, how):
     path, told = spoil(scene, how)
     code = 4 if how in ("no matches", "no geometries", "watermarks") else 3
