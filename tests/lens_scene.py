@@ -30,11 +30,12 @@ def write_scene(
     *,
     rig: bool = False,
     behind: bool = False,
+    poses: Sequence[pycolmap.Rigid3d] | None = None,
 ) -> pycolmap.Reconstruction:
     """Write the true model, sparse/0, and database.db; return the model.
 
     Frames take the cameras in turn, or are those of a rig of all cameras; the points are before or behind
-    them. A panorama goes on at its other edge.
+    them, unless poses are given. A panorama goes on at its other edge.
     """
     model, noise = pycolmap.Reconstruction(), np.random.default_rng(8)
     points = np.random.default_rng(7).uniform(-2.0, 2.0, (120, 3))
@@ -47,7 +48,7 @@ def write_scene(
             own.add_sensor(camera.sensor_id, _SENSOR)
         model.add_rig(own)
     tracks = [pycolmap.Track() for _ in points]
-    for k, pose in enumerate(_ring(num_frames, -1.0 if behind else 1.0)):
+    for k, pose in enumerate(poses or _ring(num_frames, -1.0 if behind else 1.0)):
         taking = cameras if rig else [cameras[k % len(cameras)]]
         frame = pycolmap.Frame(frame_id=k + 1, rig_id=taking[0].camera_id)
         frame.rig_from_world = pose

@@ -236,7 +236,11 @@ def _dual(motions: FloatArray, nodes: IntArray) -> FloatArray:
     gram = np.einsum("nai,naj->ij", dual, motions)
     try:
         if np.linalg.eigvalsh(gram)[0] < _COLLINEAR * np.linalg.eigvalsh(gram)[-1]:
-            dual[nodes, 3:] = own[:, 3:] * np.sum(own[:, :3] ** 2) / np.sum(own[:, 3:] ** 2)
+            turning = np.sum(own[:, 3:] ** 2)
+            if turning == 0.0:  # rotations are held, and other frames stand far from these
+                dual[nodes] = np.linalg.pinv(own.reshape(-1, own.shape[2]), 1e-15).T.reshape(own.shape)
+                return dual
+            dual[nodes, 3:] = own[:, 3:] * np.sum(own[:, :3] ** 2) / turning
             gram = np.einsum("nai,naj->ij", dual, motions)
         read: FloatArray = dual @ np.linalg.inv(gram)
     except np.linalg.LinAlgError:

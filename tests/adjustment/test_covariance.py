@@ -150,3 +150,13 @@ def test_centers_relative_to_frames_that_are_told_are_known_relative_to_these():
 def test_nodes_that_do_not_tell_the_motions_are_no_gauge(motions):
     with pytest.raises(UnsolvableError, match="do not stand apart"):
         covariance._dual(motions, np.arange(4))
+
+
+def test_motions_of_nodes_far_from_the_others_are_read_where_rotations_are_held():
+    # The scale moves the nodes by a million units, and one another by one: a ratio of squares of 1e-12.
+    motions = np.zeros((5, 6, 4))
+    motions[:, :3, :3] = np.eye(3)
+    motions[:4, :3, 3] = np.random.default_rng(0).normal([1e6, 0.0, 0.0], size=(4, 3))
+    dual = covariance._dual(motions, np.arange(4))
+    # Rounding of 1e-16 times the ratio of lengths, times those of the motions.
+    np.testing.assert_allclose(np.einsum("nai,naj->ij", dual, motions), np.eye(4), atol=1e-3)
