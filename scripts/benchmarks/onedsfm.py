@@ -29,6 +29,7 @@ from harness.record import Row, number, text_of
 from paper.baselines import FILTERS, locate_least_squares
 from sfm_shapefit import ViewGraph, place
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.pipeline.place import place_graph_file
 from sfm_shapefit.placement.place import order_pieces
 from sfm_shapefit.refinement import starts
@@ -91,7 +92,7 @@ def measure(name: str, source: Path) -> Row:
 def _answer(name: str, graph: ViewGraph) -> tuple[int, int, Any, Any]:
     """Return the numbers of cameras placed and of pairs filtered, the residuals, and the certified solve."""
     if name == "least-squares":
-        part, cameras = graph.restricted_to(order_pieces(graph, graph.num_nodes)[0].edges)
+        part, cameras = graph.restricted_to(order_pieces(MeasuredGraph(graph))[0].edges)
         baselines = normalized(differences(locate_least_squares(part), part.edges))
         return len(cameras), 0, angle_between_deg(baselines, part.directions), None
     choose, filtered = FILTERS.get(name.split(" + ", maxsplit=1)[0]), graph

@@ -8,9 +8,7 @@ from typing import Any
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import text_of
 
-_LARGEST = (
-    1e100  # absolute value of a number; squares of larger ones overflow, so that these count as infinite
-)
+_LARGEST = 1e100  # absolute value of a number; squares of larger ones overflow, so these count as infinite
 
 
 def read_json(file: Path) -> Any:

@@ -24,7 +24,6 @@ DAMAGED = [
         UNTYPED.format("cameras") + "UPDATE cameras SET prior_focal_length = x'00'",
         r"has b'\\x00' for the number prior_focal_length",
     ),
-    ("UPDATE images SET name = CAST(x'ff41' AS TEXT) WHERE image_id = 2", r"'\\udcffA' .* is no UTF-8"),
     (ENDLESS, "its cameras is a view"),
     ("UPDATE images SET camera_id = 7 WHERE image_id = 2", "id 2 has no valid name and camera"),
     ("DELETE FROM images", "has 0 images, but two or more"),
