@@ -71,10 +71,14 @@ class Reweighted:
     """The optimum refined in angles, at these weights; None where the optimum itself has more evidence."""
     mixture: ResidualMixture
     """How likely either makes all directions."""
+    start: FloatArray | None = None
+    """(n, d) another start at the same weights, where the optimum has collapsed; None where it has not."""
 
     @property
     def locations(self) -> FloatArray:
-        """(n, d) the refined optimum, or the optimum."""
+        """(n, d) the refined optimum, or the optimum, or the other start."""
+        if self.start is not None:
+            return self.start
         return self.solved.locations if self.refined is None else self.refined.locations
 
 
@@ -102,6 +106,15 @@ def solve_reweighted(
     if found is None or found.mixture.evidence <= max(_more(mixture.evidence), 0.0):
         return None
     return found if projected_length(measured.graph, found.locations) > 0.0 else None
+
+
+def solve_at_triangles(measured: MeasuredGraph, options: SolverOptions) -> Reweighted:
+    """Return ShapeFit at the posteriors that the triangles of a graph give its pairs, certified."""
+    graph = measured.graph
+    weighted = graph.with_weights(graph.weights * np.maximum(weigh_by_triangles(graph).posterior, _LEAST_WEIGHT))
+    solved = solve(weighted, options, groups=measured.groups)
+    mixture = fit_mixture(measured, solved.locations)
+    return Reweighted(graph=weighted, solved=solved, refined=None, mixture=mixture)
 
 
 def can_be_reweighted(measured: MeasuredGraph) -> bool:

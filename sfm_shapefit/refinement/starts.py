@@ -32,9 +32,16 @@ from sfm_shapefit.refinement.angular import (
 )
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture, own_variances
+from sfm_shapefit.refinement.mixture import Mixture, MixtureEnd
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
-from sfm_shapefit.refinement.reweighted import POOR_SHARE, Reweighted, can_be_reweighted, solve_reweighted
+from sfm_shapefit.refinement.reweighted import (
+    POOR_SHARE,
+    Reweighted,
+    can_be_reweighted,
+    solve_at_triangles,
+    solve_reweighted,
+)
 from sfm_shapefit.solver.options import PAIRS_AT_SCALE, SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.reduction import Reduction
@@ -51,6 +58,11 @@ _LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 
 _POINT_WEIGHT = 10.0  # LUD's weight of a direction to a 3D point; one loss there serves every noise
 _TIE = 1e-3  # relative difference of costs; a smaller one says nothing where the starts disagree
 _POINT_LENGTH = 1e-6  # share of the mean length of all pairs; the cameras of a shorter one stand in one place
+REWEIGHTED = "reweighted ShapeFit"
+"""Name of a start at other weights."""
+_EXPLAINED = 0.9  # share of right pairs that an answer explains; with less, triangles are asked too
+_FEW = 0.35  # likewise; with less, posteriors are followed from solve to solve
+_LEAST_GAIN = 1.0  # nats; of two ends nearer than that, the first is kept
 OPENING_RAD = 0.1
 """Largest width of the kernel, in radians, at which unrefined starts are compared; see `angular`."""
 
@@ -107,6 +119,8 @@ class RefinedPlacement:
     """(m,) probability that each direction is right, by its residual and those of all (`consensus`)."""
     reweighted: Reweighted | None
     """The program at other weights that the locations come from, certified; None where another was kept."""
+    variances: FloatArray | None = None
+    """(m,) variance per axis of each direction if it is right, rad^2; None where one level serves all."""
 
     @property
     def collapsed(self) -> bool:
@@ -115,7 +129,9 @@ class RefinedPlacement:
 
     @property
     def right(self) -> BoolArray | None:
-        """(m,) the directions that a reweighted start takes for right; None where most of all are."""
+        """(m,) the directions that are taken for right; None where most of all are."""
+        if self.variances is not None:
+            return np.asarray(self.posterior > 0.5)
         return None if self.reweighted is None else np.asarray(self.posterior > 0.5)
 
     def statement(self) -> str:
@@ -158,6 +174,10 @@ def refine_starts(
     problem = _Problem(measured, _plan_normal_solver(measured, options) if options.refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
+    if isinstance(problem.normal_solver, SymbolicFactor) and options.objective in ("auto", "lud"):
+        evident = _find_most_evident(problem, solved, (lud, second, apart), options)
+        if evident is not None:
+            return evident
     is_iterative = isinstance(problem.normal_solver, IterativeNormal)
     # Refinements of so many are dear, and starts that are so near to one another lead to one place.
     near = _UNEQUAL if is_iterative else _SAME if measured.num_cameras >= _MANY_CAMERAS else 0.0
@@ -209,6 +229,100 @@ def refine_starts(
     )
 
 
+def _find_most_evident(
+    problem: _Problem,
+    solved: SolverResult,
+    lud: tuple[LudResult | None, FloatArray | None, float | None],
+    options: PlacementOptions,
+) -> RefinedPlacement | None:
+    """Return the end of most evidence under a mixture of noise levels; None if no start leads to any."""
+    measured, plan = problem.measured, problem.normal_solver
+    assert isinstance(plan, SymbolicFactor)
+    graph, model, (_, second, apart) = measured.graph, Mixture(measured, plan), lud
+    # ShapeFit's optimum collapses where the starts disagree, and LUD's cannot.
+    takes_second = second is not None and (options.objective == "lud" or (apart or 0.0) > _UNEQUAL)
+    name, start = ("LUD", second) if takes_second and second is not None else ("ShapeFit", solved.locations)
+    reason = "LUD, as asked" if options.objective == "lud" else _say_start(name, apart)
+    best, reweighted = model.descend(start), None
+    if best is None:
+        return None
+    bounds = {name: -best.bound}
+    if options.objective == "auto" and can_be_reweighted(measured) and best.right_share < _EXPLAINED:
+        before = best.right_share
+        for weigh in (_by_triangles, _by_posteriors):
+            if weigh is _by_posteriors and best.right_share >= _FEW:
+                break
+            other = weigh(problem, best, options)
+            end = None if other is None else model.descend(other.locations)
+            if end is not None and other is not None:
+                bounds[REWEIGHTED] = min(bounds.get(REWEIGHTED, np.inf), -end.bound)
+                if end.bound > best.bound + _LEAST_GAIN:
+                    best, reweighted, name, start = end, other, REWEIGHTED, other.locations
+        if reweighted is not None:
+            reason = _explain_weights(before, best.right_share, reweighted)
+    best = model.improve(best)
+    levels = np.sqrt([np.median(best.variances[measured.classes == k]) for k in range(int(measured.classes.max()) + 1)])
+    chosen = Start(
+        name=name,
+        locations=start,
+        refined=AngularResult(locations=best.locations, levels_rad=levels, cost=-best.bound, iterations=0),
+        reset_nodes=np.empty(0, dtype=np.int64),
+    )
+    if projected_length(graph, best.locations) <= 0.0:
+        return None
+    return RefinedPlacement(
+        locations=normalize_locations(graph, best.locations),
+        start=name,
+        is_refined=True,
+        reason=reason,
+        disagreement=apart,
+        costs=bounds,
+        levels_deg=tuple(np.degrees(levels).tolist()),
+        moved=_measure_moves(chosen),
+        num_turned_pairs=_count_turned_pairs(measured, chosen, levels),
+        reset_nodes=chosen.reset_nodes,
+        lud=lud[0],
+        posterior=best.posterior,
+        reweighted=reweighted,
+        variances=best.variances,
+    )
+
+
+def _say_start(name: str, apart: float | None) -> str:
+    """Say why a start is refined."""
+    if apart is None:
+        return "the graph has no second start"
+    if name == "LUD":
+        return f"the starts disagree (lengths by {apart:.0%}): LUD, whose lengths cannot collapse"
+    return f"the starts' lengths differ by {apart:.1%}, so that only one is refined"
+
+
+def _by_triangles(problem: _Problem, _best: MixtureEnd, options: PlacementOptions) -> Reweighted | None:
+    """Return ShapeFit at the posteriors that triangles give the pairs, or LUD where that disagrees."""
+    graph = problem.measured.graph
+    found = solve_at_triangles(problem.measured, options.solver.at_scale(graph.num_edges))
+    if not has_second_start(graph):
+        return found
+    second = solve_lud(found.graph, _LUD_STEPS, certified=False).locations
+    if not np.isfinite(second).all() or disagreement(graph, found.locations, second) <= _UNEQUAL:
+        return found
+    return replace(found, start=second)
+
+
+def _by_posteriors(problem: _Problem, best: MixtureEnd, options: PlacementOptions) -> Reweighted | None:
+    """Return the best ShapeFit at posteriors of residuals and triangles, in turn."""
+    usual = fit_mixture(problem.measured, best.locations)
+    return _reweight(problem, best.locations, usual, options)
+
+
+def _explain_weights(before: float, after: float, reweighted: Reweighted) -> str:
+    """Say why a reweighted start is kept, and what its certificate is of."""
+    return (
+        f"the usual starts explain {before:.0%} of the pairs, this one {after:.0%}; certified to "
+        f"{max(reweighted.solved.gap, 0.0):.1e} at weights that are the pairs' posteriors"
+    )
+
+
 def _reweight(
     problem: _Problem, usual: FloatArray, mixture: ResidualMixture, options: PlacementOptions
 ) -> Reweighted | None:
@@ -229,7 +343,7 @@ def _reweight(
 def _start_of(reweighted: Reweighted) -> Start:
     """Return the reweighted start among the others."""
     return Start(
-        name="reweighted ShapeFit",
+        name=REWEIGHTED,
         locations=reweighted.solved.locations,
         refined=reweighted.refined,
         reset_nodes=np.empty(0, dtype=np.int64),
