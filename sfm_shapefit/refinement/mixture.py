@@ -48,10 +48,10 @@ _LEVELS_RAD = np.geomspace(1e-7, 0.25, 22)
 _FIRST_FLOOR_RAD = 0.05  # radians; every right pair of a usable start is within a few of these
 _NEXT_FLOOR_RAD = 0.01  # likewise after a consensus, which is near
 _FALL = 0.6  # by which the floor falls in a step
-_NOISELESS_RAD = 2.5e-4  # radians; a lower floor rejects nothing that it should not, and falls to the end
+_NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
 _PSEUDO_WRONG, _PSEUDO_LEVEL = 1.0, 0.05  # pairs that each share is fitted with beside the real ones
-_FIT_ROUNDS, _LAST_FIT_ROUNDS = 2, 10  # rounds of the shares per step, and where the floor is still or new
-_SETTLED = 1e-3  # change of a share; a smaller one is none
+_FIT_ROUNDS, _FIRST_FIT_ROUNDS = 4, 10  # rounds of the shares per step; the next step goes on
+_SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # least and largest standard deviation of log lengths
 _SPREAD = 1.25  # standard deviations of a normal variable per mean absolute deviation
 _SHORTEST = 3e-3  # median lengths; the floor under lengths, below which a baseline has no direction
@@ -147,7 +147,7 @@ class Mixture:
         for step in range(_MOST_STEPS):
             at = self._residuals(t)
             expected = at.errors**2 + variances
-            for _ in range(_FIT_ROUNDS if step and floor > _LEVELS_RAD[0] else _LAST_FIT_ROUNDS):
+            for _ in range(_FIT_ROUNDS if step else _FIRST_FIT_ROUNDS):
                 last, shares = shares, self._fit(expected, shares, floor)
                 if np.abs(shares - last).max() <= _SETTLED:
                     break
@@ -175,11 +175,11 @@ class Mixture:
                 locations=t, bound=bound, posterior=posterior, variances=total, shares=shares
             )
             variances = self._propagate(at)
-            if floor <= _LEVELS_RAD[0] and step and abs(bound - before) < _LEAST_GAIN:
+            if floor <= _NOISELESS_RAD and abs(bound - before) < _LEAST_GAIN:
                 break
             t = t if moved is None else moved
             damping = max(damping / 10.0, _DAMPING[1]) if moved is not None else _DAMPING[0]
-            floor = floor * _FALL if floor * _FALL >= _NOISELESS_RAD else float(_LEVELS_RAD[0])
+            floor = max(floor * _FALL, float(_LEVELS_RAD[0]))
         return end
 
     def _scaled(self, t: FloatArray) -> FloatArray:

@@ -174,7 +174,7 @@ def refine_starts(
     problem = _Problem(measured, _plan_normal_solver(measured, options) if options.refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
-    if isinstance(problem.normal_solver, SymbolicFactor) and options.objective in ("auto", "lud"):
+    if isinstance(problem.normal_solver, SymbolicFactor) and _is_bare(measured):
         evident = _find_most_evident(problem, solved, (lud, second, apart), options)
         if evident is not None:
             return evident
@@ -227,6 +227,11 @@ def refine_starts(
         posterior=(usual if reweighted is None else reweighted.mixture).posterior,
         reweighted=reweighted,
     )
+
+
+def _is_bare(measured: MeasuredGraph) -> bool:
+    """Return whether nobody knows how noisy the directions are, and these are enough to learn it from."""
+    return measured.evidence is None and measured.num_points == 0 and can_be_reweighted(measured)
 
 
 def _find_most_evident(
