@@ -77,7 +77,9 @@ def find_agreement(
         )
     excess, agrees = _excess(residuals, covariances, behind, num_unknowns, used)
     level = _level(angles[used], num_unknowns, freedom)
-    return AngularAgreement(angles_rad=angles, agrees=agrees, level_rad=level, excess_rad=np.full(len(angles), excess))
+    return AngularAgreement(
+        angles_rad=angles, agrees=agrees, level_rad=level, excess_rad=np.full(len(angles), excess)
+    )
 
 
 def own_covariances(measured: MeasuredGraph) -> FloatArray:

@@ -31,13 +31,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import tangent_bases
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.base.scipy_parts import expit, gammaln, logit
+from sfm_shapefit.base.scipy_parts import gammaln, logit
 from sfm_shapefit.graph.measured import MeasuredGraph
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
+from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.consensus import put_by_consensus
@@ -171,9 +171,7 @@ class Mixture:
                 return end
             before, bound = bound, self._log_determinant(blocks, tau) - cost
             posterior, total = self._judge(expected, shares)
-            end = MixtureEnd(
-                locations=t, bound=bound, posterior=posterior, variances=total, shares=shares
-            )
+            end = MixtureEnd(locations=t, bound=bound, posterior=posterior, variances=total, shares=shares)
             variances = self._propagate(at)
             if floor <= _NOISELESS_RAD and abs(bound - before) < _LEAST_GAIN:
                 break
@@ -268,7 +266,9 @@ class Mixture:
         across = self._across(at)
         stiffness = self._weights / tau**2
         along = at.units[:, :, None] * at.units[:, None, :]
-        blocks = (across * information[:, None, :]) @ across.transpose(0, 2, 1) + stiffness[:, None, None] * along
+        blocks = (across * information[:, None, :]) @ across.transpose(0, 2, 1) + stiffness[
+            :, None, None
+        ] * along
         blocks = blocks / at.lengths[:, None, None] ** 2
         blocks += (_RIDGE * np.trace(blocks, axis1=1, axis2=2))[:, None, None] * np.eye(along.shape[1])
         pull = np.einsum("edk,ek->ed", across, information * at.errors)

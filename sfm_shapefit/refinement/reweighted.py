@@ -111,7 +111,9 @@ def solve_reweighted(
 def solve_at_triangles(measured: MeasuredGraph, options: SolverOptions) -> Reweighted:
     """Return ShapeFit at the posteriors that the triangles of a graph give its pairs, certified."""
     graph = measured.graph
-    weighted = graph.with_weights(graph.weights * np.maximum(weigh_by_triangles(graph).posterior, _LEAST_WEIGHT))
+    weighted = graph.with_weights(
+        graph.weights * np.maximum(weigh_by_triangles(graph).posterior, _LEAST_WEIGHT)
+    )
     solved = solve(weighted, options, groups=measured.groups)
     mixture = fit_mixture(measured, solved.locations)
     return Reweighted(graph=weighted, solved=solved, refined=None, mixture=mixture)

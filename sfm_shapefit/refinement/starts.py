@@ -62,7 +62,6 @@ REWEIGHTED = "reweighted ShapeFit"
 """Name of a start at other weights."""
 _EXPLAINED = 0.9  # share of right pairs that an answer explains; with less, triangles are asked too
 _FEW = 0.35  # likewise; with less, posteriors are followed from solve to solve
-_LEAST_GAIN = 1.0  # nats; of two ends nearer than that, the first is kept
 OPENING_RAD = 0.1
 """Largest width of the kernel, in radians, at which unrefined starts are compared; see `angular`."""
 
@@ -174,10 +173,12 @@ def refine_starts(
     problem = _Problem(measured, _plan_normal_solver(measured, options) if options.refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
-    if isinstance(problem.normal_solver, SymbolicFactor) and _is_bare(measured):
-        evident = _find_most_evident(problem, solved, (lud, second, apart), options)
-        if evident is not None:
-            return evident
+    if options.objective == "mixture":
+        options = replace(options, objective="auto")
+        if isinstance(problem.normal_solver, SymbolicFactor) and _is_bare(measured):
+            evident = _find_most_evident(problem, solved, (lud, second, apart), options)
+            if evident is not None:
+                return evident
     is_iterative = isinstance(problem.normal_solver, IterativeNormal)
     # Refinements of so many are dear, and starts that are so near to one another lead to one place.
     near = _UNEQUAL if is_iterative else _SAME if measured.num_cameras >= _MANY_CAMERAS else 0.0
@@ -230,76 +231,74 @@ def refine_starts(
 
 
 def _is_bare(measured: MeasuredGraph) -> bool:
-    """Return whether nobody knows how noisy the directions are, and these are enough to learn it from."""
+    """Return whether nodes are cameras that move one by one, and directions enough to learn noise from."""
     return measured.evidence is None and measured.num_points == 0 and can_be_reweighted(measured)
+
+
+class _Candidate(NamedTuple):
+    """A start, where its descent ended, and the program that it comes from, if that has other weights."""
+
+    name: str
+    start: FloatArray
+    end: MixtureEnd
+    reweighted: Reweighted | None = None
 
 
 def _find_most_evident(
     problem: _Problem,
     solved: SolverResult,
-    lud: tuple[LudResult | None, FloatArray | None, float | None],
+    second: tuple[LudResult | None, FloatArray | None, float | None],
     options: PlacementOptions,
 ) -> RefinedPlacement | None:
     """Return the end of most evidence under a mixture of noise levels; None if no start leads to any."""
-    measured, plan = problem.measured, problem.normal_solver
+    measured, plan, (lud, other, apart) = problem.measured, problem.normal_solver, second
     assert isinstance(plan, SymbolicFactor)
-    graph, model, (_, second, apart) = measured.graph, Mixture(measured, plan), lud
+    model = Mixture(measured, plan)
     # ShapeFit's optimum collapses where the starts disagree, and LUD's cannot.
-    takes_second = second is not None and (options.objective == "lud" or (apart or 0.0) > _UNEQUAL)
-    name, start = ("LUD", second) if takes_second and second is not None else ("ShapeFit", solved.locations)
-    reason = "LUD, as asked" if options.objective == "lud" else _say_start(name, apart)
-    best, reweighted = model.descend(start), None
-    if best is None:
+    is_lud = other is not None and apart is not None and apart > _UNEQUAL
+    name, start = ("LUD", other) if is_lud and other is not None else ("ShapeFit", solved.locations)
+    end = model.descend(start)
+    if end is None:
         return None
-    bounds = {name: -best.bound}
-    if options.objective == "auto" and can_be_reweighted(measured) and best.right_share < _EXPLAINED:
-        before = best.right_share
-        for weigh in (_by_triangles, _by_posteriors):
-            if weigh is _by_posteriors and best.right_share >= _FEW:
-                break
-            other = weigh(problem, best, options)
-            end = None if other is None else model.descend(other.locations)
-            if end is not None and other is not None:
-                bounds[REWEIGHTED] = min(bounds.get(REWEIGHTED, np.inf), -end.bound)
-                if end.bound > best.bound + _LEAST_GAIN:
-                    best, reweighted, name, start = end, other, REWEIGHTED, other.locations
-        if reweighted is not None:
-            reason = _explain_weights(before, best.right_share, reweighted)
-    best = model.improve(best)
-    levels = np.sqrt([np.median(best.variances[measured.classes == k]) for k in range(int(measured.classes.max()) + 1)])
+    candidates = [_Candidate(name, start, end)]
+    for weigh, share in ((_by_triangles, _EXPLAINED), (_by_posteriors, _FEW)):
+        best = max(candidates, key=lambda candidate: candidate.end.bound)
+        if best.end.right_share < share and (found := weigh(problem, best.end, options)) is not None:
+            end = model.descend(found.locations)
+            if end is not None:
+                candidates.append(_Candidate(REWEIGHTED, found.locations, end, found))
+    best = max(candidates, key=lambda candidate: candidate.end.bound)
+    end = model.improve(best.end)
+    if projected_length(measured.graph, end.locations) <= 0.0:
+        return None
+    reason = (
+        f"it has most evidence of {len(candidates)} starts, and explains {end.right_share:.0%} of the pairs"
+    )
+    if best.reweighted is not None:
+        reason += f"; {_say_certified(best.reweighted)}"
+    levels = np.array([np.sqrt(np.median(end.variances))])
     chosen = Start(
-        name=name,
-        locations=start,
-        refined=AngularResult(locations=best.locations, levels_rad=levels, cost=-best.bound, iterations=0),
+        name=best.name,
+        locations=best.start,
+        refined=AngularResult(locations=end.locations, levels_rad=levels, cost=-end.bound, iterations=0),
         reset_nodes=np.empty(0, dtype=np.int64),
     )
-    if projected_length(graph, best.locations) <= 0.0:
-        return None
     return RefinedPlacement(
-        locations=normalize_locations(graph, best.locations),
-        start=name,
+        locations=normalize_locations(measured.graph, end.locations),
+        start=best.name,
         is_refined=True,
         reason=reason,
         disagreement=apart,
-        costs=bounds,
-        levels_deg=tuple(np.degrees(levels).tolist()),
+        costs={c.name: -c.end.bound for c in sorted(candidates, key=lambda c: c.end.bound)},
+        levels_deg=(float(np.degrees(levels[0])),),
         moved=_measure_moves(chosen),
         num_turned_pairs=_count_turned_pairs(measured, chosen, levels),
         reset_nodes=chosen.reset_nodes,
-        lud=lud[0],
-        posterior=best.posterior,
-        reweighted=reweighted,
-        variances=best.variances,
+        lud=lud,
+        posterior=end.posterior,
+        reweighted=best.reweighted,
+        variances=end.variances,
     )
-
-
-def _say_start(name: str, apart: float | None) -> str:
-    """Say why a start is refined."""
-    if apart is None:
-        return "the graph has no second start"
-    if name == "LUD":
-        return f"the starts disagree (lengths by {apart:.0%}): LUD, whose lengths cannot collapse"
-    return f"the starts' lengths differ by {apart:.1%}, so that only one is refined"
 
 
 def _by_triangles(problem: _Problem, _best: MixtureEnd, options: PlacementOptions) -> Reweighted | None:
@@ -320,12 +319,9 @@ def _by_posteriors(problem: _Problem, best: MixtureEnd, options: PlacementOption
     return _reweight(problem, best.locations, usual, options)
 
 
-def _explain_weights(before: float, after: float, reweighted: Reweighted) -> str:
-    """Say why a reweighted start is kept, and what its certificate is of."""
-    return (
-        f"the usual starts explain {before:.0%} of the pairs, this one {after:.0%}; certified to "
-        f"{max(reweighted.solved.gap, 0.0):.1e} at weights that are the pairs' posteriors"
-    )
+def _say_certified(reweighted: Reweighted) -> str:
+    """Say what the certificate of a program at other weights is of."""
+    return f"certified to {max(reweighted.solved.gap, 0.0):.1e} at weights that are the pairs' posteriors"
 
 
 def _reweight(
@@ -358,11 +354,8 @@ def _start_of(reweighted: Reweighted) -> Start:
 def _explain(usual: ResidualMixture, reweighted: Reweighted) -> str:
     """Say why a reweighted start is kept, and what its certificate is of."""
     before, after = usual.shares[0], reweighted.mixture.shares[0]
-    gap = max(reweighted.solved.gap, 0.0)
-    return (
-        f"the usual starts explain {before:.0%} of the pairs, this one {after:.0%}; "
-        f"certified to {gap:.1e} at weights that are the pairs' posteriors"
-    )
+    explained = f"the usual starts explain {before:.0%} of the pairs, this one {after:.0%}"
+    return f"{explained}; {_say_certified(reweighted)}"
 
 
 def _plan_normal_solver(
