@@ -62,7 +62,7 @@ _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; othe
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
-_DAMPING = (1e-3, 1e-10, 1e2)  # of the median information: first, least, most; more moves nothing
+_DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
 _LEAST_GAIN = 0.5  # nats; a smaller change of the bound is none
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
@@ -97,38 +97,27 @@ class _Residuals(NamedTuple):
     """The directions at some locations (n, d)."""
 
     locations: FloatArray
-    lengths: FloatArray
-    """(m,) lengths of the baselines, floored."""
-    units: FloatArray
-    """(m, d) directions of the baselines."""
-    errors: FloatArray
-    """(m, d - 1) errors of the directions along the axes of their covariances, radians."""
+    lengths: FloatArray  # (m,) floored
+    units: FloatArray  # (m, d) directions of the baselines
+    errors: FloatArray  # (m, d - 1) along the axes of the covariances, radians
 
 
 class _Noise(NamedTuple):
-    """The levels of one step."""
+    """The model of one step."""
 
-    shares: FloatArray
-    """(K + 1,)"""
-    floor: float
-    """Radians; lower levels count as this one."""
-    variances: FloatArray
-    """(m, d - 1) variance of each residual by that of the locations, rad^2."""
-    precision: float
-    """Of a log length, the prior's share of each pair included."""
+    shares: FloatArray  # (K + 1,)
+    floor: float  # radians; lower levels count as this one
+    variances: FloatArray  # (m, d - 1) rad^2, residuals by the locations
+    precision: float  # 1 / variance of a log length in the prior
 
 
 class _System(NamedTuple):
-    """The equations of a step."""
+    """The equations of one step."""
 
-    blocks: FloatArray
-    """(m, d, d) of the normal matrix."""
-    gradient: FloatArray
-    """(m, d) of the cost by the baselines."""
-    damping_unit: FloatArray
-    """(m,)"""
-    cost: float
-    """Minus the log of likelihood and prior."""
+    blocks: FloatArray  # (m, d, d) parts of the normal matrix
+    gradient: FloatArray  # (m, d) derivative of the cost by the baselines
+    damping_unit: FloatArray  # (m,)
+    cost: float  # minus the log of likelihood and prior
 
 
 class Mixture:
@@ -292,7 +281,7 @@ class Mixture:
     def _log_determinant(self, system: _System, noise: _Noise) -> float:
         """Return log det(S) / 2 of the present factor, in units of the prior's precision."""
         n, d = self._graph.num_nodes, self._graph.dimension
-        ground = 2.0 * float(np.trace(system.blocks, axis1=1, axis2=2).sum()) / (d * n)  # of `refactor`
+        ground = 2.0 * float(np.trace(system.blocks, axis1=1, axis2=2).sum()) / (d * n)  # as `refactor` adds
         free = d * np.log(ground) + (d * (n - 1) - 1) * np.log(noise.precision)
         return 0.5 * float(free - self._factor.log_determinant())
 

@@ -71,14 +71,10 @@ class Reweighted:
     """The optimum refined in angles, at these weights; None where the optimum itself has more evidence."""
     mixture: ResidualMixture
     """How likely either makes all directions."""
-    start: FloatArray | None = None
-    """(n, d) another start at the same weights, where the optimum has collapsed; None where it has not."""
 
     @property
     def locations(self) -> FloatArray:
-        """(n, d) the refined optimum, or the optimum, or the other start."""
-        if self.start is not None:
-            return self.start
+        """(n, d) the refined optimum, or the optimum."""
         return self.solved.locations if self.refined is None else self.refined.locations
 
 
