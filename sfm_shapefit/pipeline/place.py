@@ -53,14 +53,15 @@ def place(
         measured: any view graph with at least one edge, or its text file, best with what is known of its
             directions; what its largest rigid piece leaves out is not placed.
         options: settings, see `help(PlacementOptions)`; defaults if None.
-        sigma: (m,) standard deviation of each direction per axis, radians, or (m, d - 1, d - 1) covariance in
-            `tangent_bases(graph.directions)`, rad^2; NaN where unknown. Noise that the residuals show beyond it
-            is added. If None, all are unknown, or as `measured` states them.
+        sigma: (m,) standard deviation of each direction per axis, radians, or its (m, d - 1, d - 1) covariance
+            in `tangent_bases(graph.directions)`, rad^2; NaN where unknown, None if all are. Noise that the
+            residuals show beyond it is added.
         on_iteration: as of `place_pieces`.
         **overrides: single options by name: `place(graph, refine=False)`.
 
     Raises:
-        InputError: if sigma is of another shape, negative or infinite; and, as UnsolvableError, by `place_pieces`.
+        InputError: if sigma has another shape, or negative or infinite values; else as `place_pieces`.
+        UnsolvableError: as `place_pieces`.
     """
     options = merge_options(options, PlacementOptions, overrides)
     measured = read_graph(measured) if isinstance(measured, Path | str) else measured
@@ -78,14 +79,13 @@ def _covariances(graph: ViewGraph, sigma: npt.ArrayLike) -> FloatArray:
             f"sigma has shape {given.shape}; give one standard deviation, radians, for each of the {m} "
             f"directions, or covariances of shape {(m, k, k)}"
         )
-    covariances = np.square(given)[:, None, None] * np.eye(k) if given.ndim == 1 else given
-    negative = np.linalg.eigvalsh(np.nan_to_num(given)) if given.ndim == 3 else given
-    if np.isinf(given).any() or np.any(negative < 0.0):
+    least = given if given.ndim == 1 else np.linalg.eigvalsh(np.nan_to_num(given))
+    if np.isinf(given).any() or np.any(least < 0.0):
         raise InputError(
             "sigma has negative or infinite values; give standard deviations or covariances, and NaN where "
             "they are unknown"
         )
-    return covariances
+    return np.asarray(np.square(given)[:, None, None] * np.eye(k) if given.ndim == 1 else given)
 
 
 def place_graph_file(
