@@ -53,7 +53,7 @@ def place(
         measured: any view graph with at least one edge, or its text file, best with what is known of its
             directions; what its largest rigid piece leaves out is not placed.
         options: settings, see `help(PlacementOptions)`; defaults if None.
-        sigma: (m,) standard deviation of each direction per axis, radians, or its (m, d - 1, d - 1) covariance
+        sigma: (m,) standard deviation of each direction per axis, radians, or (m, d - 1, d - 1) covariances
             in `tangent_bases(graph.directions)`, rad^2; NaN where unknown, None if all are. Noise that the
             residuals show beyond it is added.
         on_iteration: as of `place_pieces`.

@@ -61,7 +61,8 @@ _POINT_LENGTH = 1e-6  # share of the mean length of all pairs; the cameras of a 
 _EXPLAINED = 0.9  # share of the pairs; an answer that explains fewer may be a fold, and triangles are asked
 _POORLY_EXPLAINED = 0.35  # share of the pairs; below, posteriors are followed from solve to solve, too
 _NO_MIXTURE = (
-    "; no mixture of noise levels, which takes cameras that move one by one, ten or more, tied by many pairs"
+    "; not by a mixture of noise levels: that takes a bare graph, refined, of ten cameras or more that move "
+    "one by one, each in several pairs"
 )
 OPENING_RAD = 0.1
 """Largest width of the kernel, in radians, at which unrefined starts are compared; see `angular`."""
@@ -101,9 +102,9 @@ class RefinedPlacement:
     disagreement: float | None
     """Standard deviation of the log ratio of node lengths between the two starts; None with one start."""
     costs: dict[str, float]
-    """Robust cost of what each start led to, all at `levels_deg`."""
+    """Robust cost of what each start led to, all at `levels_deg`; under a mixture, minus its evidence."""
     levels_deg: tuple[float, ...]
-    """Noise level of each class of directions: between cameras, then from cameras to points."""
+    """Noise level of each class of directions: between cameras, then to points; a mixture's median."""
     moved: tuple[float, float]
     """Median and largest move of a node by the refinement, as a share of the median distance from the
     center."""
@@ -306,7 +307,7 @@ def _descend_from_starts(model: Mixture, problem: _Problem, options: PlacementOp
         return []
     candidates = [_Candidate(name, start, end)]
     for other, weigh, share in (
-        ("triangles", _by_triangles, _EXPLAINED),
+        ("ShapeFit at triangles", _by_triangles, _EXPLAINED),
         ("reweighted ShapeFit", _by_posteriors, _POORLY_EXPLAINED),
     ):
         best = max(candidates, key=lambda candidate: candidate.end.bound).end
