@@ -272,7 +272,7 @@ class _Candidate(NamedTuple):
 def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | None:
     """Return the end of most evidence under a mixture of noise levels; None if the graph has no such end."""
     measured, plan = problem.measured, problem.normal_solver
-    is_bare = measured.evidence is None and measured.num_points == 0 and measured.groups is None
+    is_bare = measured.evidence is None and measured.num_points == 0
     if not (is_bare and isinstance(plan, SymbolicFactor) and can_be_reweighted(measured)):
         return None
     model = Mixture(measured, plan)

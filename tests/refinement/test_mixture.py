@@ -112,17 +112,16 @@ def test_the_posterior_tells_right_pairs_from_wrong_ones_and_standard_deviations
     assert 0.25 < z < 1.5  # the prior of lengths makes errors smaller, and the trust knows nothing of it
 
 
-def test_a_pair_that_a_loose_camera_fits_exactly_is_not_believed_for_that():
-    problem = corrupted(0.3, n=40, sigma=0.002)
-    graph, rng = problem.view_graph, np.random.default_rng(1)
-    rays = normalized(rng.normal(size=(2, 3)))
-    rays[1] -= rays[0] * (rays[1] @ rays[0])
-    n = graph.num_nodes
-    ends = np.argsort(problem.locations @ np.cross(*rays))[[n // 2, n // 2 + 1]]
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_pair_that_a_loose_camera_fits_exactly_is_not_believed_for_that(seed):
+    problem = corrupted(0.3, 2, n=40, sigma=0.002)
+    graph, n = problem.view_graph, problem.view_graph.num_nodes
+    rng = np.random.default_rng(seed)
+    ends = rng.choice(n, 2, replace=False)
     loose = ViewGraph(
         n + 1,
         np.concatenate([graph.edges, [(n, ends[0]), (n, ends[1])]]),
-        np.concatenate([graph.directions, normalized(rays)]),
+        np.concatenate([graph.directions, normalized(rng.normal(size=(2, 2)))]),  # two lines always meet
     )
     found = place(loose, objective="mixture")
     assert np.isfinite(found.locations).all()
@@ -142,12 +141,13 @@ def test_the_answer_is_the_same_to_the_bit_for_any_number_of_threads(on_street):
 
 def test_names_and_senses_of_pairs_do_not_matter(on_street):
     graph, *_, found = on_street
-    names = np.random.default_rng(0).permutation(graph.num_nodes)
-    renamed = ViewGraph(graph.num_nodes, names[graph.edges][:, ::-1], -graph.directions)
+    rng = np.random.default_rng(0)
+    names, order = rng.permutation(graph.num_nodes), rng.permutation(graph.num_edges)
+    renamed = ViewGraph(graph.num_nodes, names[graph.edges][order, ::-1], -graph.directions[order])
     there = place(renamed, objective="mixture")
-    # Descents end where a step gains less than half a nat, a small part of the standard deviation.
-    assert shape_error(there.locations[names], found.locations) < 2e-3
-    assert np.mean(there.agreement.agrees == found.agreement.agrees) > 0.99
+    # Descents end where a step gains less than half a nat: here a quarter of the error, which is 0.019.
+    assert shape_error(there.locations[names], found.locations) < 5e-3
+    assert np.mean(there.agreement.agrees == found.agreement.agrees[order]) > 0.99
 
 
 def test_rigid_groups_and_few_cameras_are_placed_the_usual_way_and_that_is_said():
