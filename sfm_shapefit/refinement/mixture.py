@@ -154,7 +154,7 @@ class Mixture:
         return end
 
     def _descend(self, start: FloatArray, floor: float, shares: FloatArray) -> MixtureEnd | None:
-        at, damping, bound, end = self._residuals(start), _DAMPING[0], -np.inf, None
+        at, damping, bound, last = self._residuals(start), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
         for _ in range(_MOST_STEPS):
             shares = self._fit(at.errors**2 + variances, shares, floor)
@@ -164,12 +164,12 @@ class Mixture:
             if moved is None:
                 break
             before, bound = bound, self._log_determinant(system, noise) - system.cost
-            end = self._judge(at, noise, bound)
+            last = at, noise, bound
             if floor <= _NOISELESS_RAD and abs(bound - before) < _LEAST_GAIN:
                 break
             variances, at = self._propagate(at), moved  # the variance of a residual hardly moves in a step
             floor = max(floor * _FALL, float(_LEVELS_RAD[0]))
-        return end
+        return None if last is None else self._judge(*last)
 
     def _step(
         self, at: _Residuals, noise: _Noise, system: _System, damping: float
@@ -291,7 +291,7 @@ class Mixture:
         inverse = selected_inverse(self._factor, self._graph.edges)
         relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
         across = self._across(at)
-        variances = np.einsum("eak,eab,ebk->ek", across, relative, across) / at.lengths[:, None] ** 2
+        variances = np.sum(across * (relative @ across), axis=1) / at.lengths[:, None] ** 2
         return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
 
     def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
