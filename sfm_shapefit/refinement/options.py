@@ -20,7 +20,7 @@ class PlacementOptions(Composed):
         "does not collapse on long chains, refines both and keeps the one that fits the angles "
         'better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit; '
         '"mixture" places a bare graph where a mixture of noise levels has most evidence: for streets, pairs '
-        "of uneven noise and scenes that repeat themselves, in two to four times the time.",
+        "of uneven noise and scenes that repeat themselves, in two to five times the time.",
     )
     refine: bool = option(
         True, 'Refine the start robustly in the angles of the directions; not for "shapefit".'

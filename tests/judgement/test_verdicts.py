@@ -75,7 +75,9 @@ def test_the_excess_is_what_the_covariances_leave_unexplained():
     t = fit_angles(t, edges, v, 4)
     graph = ViewGraph(30, edges, v)
     less, more = (
-        find_agreement(MeasuredGraph(graph, covariance=covariances(len(edges), share * SIGMA)), t).excess_rad
+        find_agreement(MeasuredGraph(graph, covariance=covariances(len(edges), share * SIGMA)), t).excess_rad[
+            0
+        ]
         for share in (0.6, 1.2)
     )
     assert less == pytest.approx(0.8 * SIGMA, rel=0.15)
