@@ -27,4 +27,5 @@ INDEX = {
     "trust": "Standard deviations and trust against errors; wrong rotations recognized.",
     "uncertainty": "Errors of delivered cameras over their standard deviations.",
     "verdict": "Spoiled models: called good, named rightly; sound ones: doubted.",
+    "viewgraphs": "A public benchmark of view graphs, ViewGraphBench, beside its own methods.",
 }

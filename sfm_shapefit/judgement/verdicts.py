@@ -157,7 +157,7 @@ def find_hold(
     """
     graph, freedom, inliers = measured.graph, measured.graph.dimension - 1, agreement.agrees
     own, excess, bases = own_covariances(measured), agreement.excess_rad, tangent_bases(graph.directions)
-    information = np.linalg.inv(own + excess**2 * np.eye(freedom))
+    information = np.linalg.inv(own + (excess**2)[:, None, None] * np.eye(freedom))
     sigma_of_pair = np.sqrt(np.trace(own, axis1=1, axis2=2) / freedom + excess**2)
     # Exact directions are propagated as if they had some noise, and scaled back.
     scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
@@ -186,8 +186,8 @@ class _Sampled(NamedTuple):
 
     errors: FloatArray
     """(m, s, d - 1) that sharing keypoints explains, in tangent bases, radians."""
-    excess: float
-    """Standard deviation of what it does not explain."""
+    excess: FloatArray
+    """(m,) standard deviation of what it does not explain."""
     scale: float
     """By which the errors are divided."""
 
@@ -196,7 +196,8 @@ class _Sampled(NamedTuple):
         random = np.random.default_rng(0)
         for start in range(0, len(self.errors), _PART):
             own = self.errors[start : start + _PART]
-            whole = own + self.excess * random.standard_normal(own.shape)
+            excess = self.excess[start : start + _PART, None, None]
+            whole = own + excess * random.standard_normal(own.shape)
             first, last = np.searchsorted(rows, (start, start + _PART))
             chosen = rows[first:last]
             bases = tangent_bases(directions[chosen]).transpose(0, 2, 1)

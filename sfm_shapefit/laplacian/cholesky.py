@@ -160,6 +160,16 @@ class CholeskyFactor:
         self.weakest_node = int(self.symbolic.permutation[int(pivot[1]) // self.block])
         return not failed and bool(pivot[0] > PIVOT_TOLERANCE * np.finfo(self.dtype).eps)
 
+    def log_determinant(self) -> float:
+        """Return the logarithm of the determinant of the factored matrix, its grounding included."""
+        plan, b, total = self.symbolic, self.block, 0.0
+        widths = np.diff(plan.first) * b
+        heights = np.diff(plan.row_pointers) * b
+        for s, (width, below) in enumerate(zip(widths.tolist(), heights.tolist(), strict=True)):
+            panel = self.panels[int(plan.panel_pointers[s]) * b * b :][: width * (width + below)]
+            total += float(np.log(panel[:: width + below + 1][:width]).sum())
+        return 2.0 * total
+
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with L x = rhs, with x = 0 at the grounded node, in float64.
 

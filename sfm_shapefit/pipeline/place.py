@@ -1,11 +1,14 @@
 """`place GRAPH`: a bare view graph, or relative poses of pairs, placed by the same steps as `locate`."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.result import GraphResult
@@ -33,6 +36,7 @@ def place(
     measured: MeasuredGraph | ViewGraph | Path | str,
     options: PlacementOptions | None = None,
     *,
+    sigma: npt.ArrayLike | None = None,
     on_iteration: OnIteration | None = None,
     **overrides: Any,
 ) -> Judged:
@@ -49,16 +53,39 @@ def place(
         measured: any view graph with at least one edge, or its text file, best with what is known of its
             directions; what its largest rigid piece leaves out is not placed.
         options: settings, see `help(PlacementOptions)`; defaults if None.
+        sigma: (m,) standard deviation of each direction per axis, radians, or (m, d - 1, d - 1) covariances
+            in `tangent_bases(graph.directions)`, rad^2; NaN where unknown, None if all are. Noise that the
+            residuals show beyond it is added.
         on_iteration: as of `place_pieces`.
         **overrides: single options by name: `place(graph, refine=False)`.
 
     Raises:
-        InputError, UnsolvableError: as `place_pieces`.
+        InputError: if sigma has another shape, or negative or infinite values; else as `place_pieces`.
+        UnsolvableError: as `place_pieces`.
     """
     options = merge_options(options, PlacementOptions, overrides)
     measured = read_graph(measured) if isinstance(measured, Path | str) else measured
     graph = MeasuredGraph(measured) if isinstance(measured, ViewGraph) else measured
+    if sigma is not None:
+        graph = replace(graph, covariance=_covariances(graph.graph, sigma))
     return judge(next(place_pieces(graph, options, on_iteration=on_iteration)), options)
+
+
+def _covariances(graph: ViewGraph, sigma: npt.ArrayLike) -> FloatArray:
+    """Return the covariances (m, d - 1, d - 1) of directions from these, or from standard deviations (m,)."""
+    given, m, k = np.asarray(sigma, dtype=np.float64), graph.num_edges, graph.dimension - 1
+    if given.shape not in ((m,), (m, k, k)):
+        raise InputError(
+            f"sigma has shape {given.shape}; give one standard deviation, radians, for each of the {m} "
+            f"directions, or covariances of shape {(m, k, k)}"
+        )
+    least = given if given.ndim == 1 else np.linalg.eigvalsh(np.nan_to_num(given))
+    if np.isinf(given).any() or np.any(least < 0.0):
+        raise InputError(
+            "sigma has negative or infinite values; give standard deviations or covariances, and NaN where "
+            "they are unknown"
+        )
+    return np.asarray(np.square(given)[:, None, None] * np.eye(k) if given.ndim == 1 else given)
 
 
 def place_graph_file(

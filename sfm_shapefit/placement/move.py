@@ -22,5 +22,6 @@ def move_cameras(placement: Placement, locations: FloatArray) -> Placement:
         locations=follow_cameras(placement.measured_part(), moved),
         reason=f"{refined.reason}; then adjusted to the pixels, which moved cameras by {by:.2%} (median)",
         reset_nodes=np.setdiff1d(refined.reset_nodes, np.flatnonzero(has_location)),
+        variances=None,
     )
     return replace_locations(placement, adjusted)

@@ -242,7 +242,7 @@ def _place_piece(
         piece=k,
         certified=solved,
         refined=refined,
-        agreement=find_agreement(part, refined.locations, refined.right),
+        agreement=find_agreement(part, refined.locations, refined.right, refined.variances),
         history=tuple(history),
         unit=unit,
     )
@@ -263,7 +263,8 @@ def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placem
     """
     moved = {item.name: getattr(placement, item.name) for item in fields(Placement)}
     moved["refined"] = refined
-    moved["agreement"] = find_agreement(placement.measured_part(), refined.locations, refined.right)
+    part = placement.measured_part()
+    moved["agreement"] = find_agreement(part, refined.locations, refined.right, refined.variances)
     return Placement(**moved)
 
 

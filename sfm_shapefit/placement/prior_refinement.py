@@ -52,6 +52,7 @@ def pull_to_priors(
         refined,
         locations=(moved - gauge.similarity.translation) / gauge.similarity.scale,
         reset_nodes=np.setdiff1d(refined.reset_nodes, held),
+        variances=None,
     )
     return Pulled(
         replace_locations(placement, kept),

@@ -44,16 +44,20 @@ class AngularAgreement:
     """(m,)"""
     level_rad: float
     """Standard deviation, per axis, of the residuals of all directions together (from their median)."""
-    excess_rad: float
-    """The part of it, per axis, that the directions' own covariances do not explain."""
+    excess_rad: FloatArray
+    """(m,) The part of each, per axis, that the direction's own covariance does not explain."""
 
 
 def find_agreement(
-    measured: MeasuredGraph, locations: FloatArray, right: BoolArray | None = None
+    measured: MeasuredGraph,
+    locations: FloatArray,
+    right: BoolArray | None = None,
+    variances: FloatArray | None = None,
 ) -> AngularAgreement:
     """Return which directions agree with locations (n, d) of a measured graph.
 
     Where most directions may be wrong, the level of all is first that of those that are taken for `right`.
+    Where each has a variance (m,), rad^2, by a mixture of levels, those for right agree.
     """
     graph, freedom = measured.graph, measured.graph.dimension - 1
     covariances = own_covariances(measured)
@@ -63,10 +67,19 @@ def find_agreement(
     num_moving = graph.num_nodes if measured.groups is None else measured.groups.num_groups
     num_unknowns = graph.dimension * (num_moving - 1) - (0 if measured.has_scale else 1)
     used: BoolArray = np.ones(graph.num_edges, dtype=np.bool_) if right is None else right
-    excess, agrees = _excess(residuals, covariances, behind, num_unknowns, used)
     angles = np.linalg.norm(residuals, axis=1)
+    if variances is not None:
+        own = np.trace(covariances, axis1=1, axis2=2) / freedom
+        excesses = np.sqrt(np.maximum(variances - own, _MIN_LEVEL_RAD**2))
+        level = float(np.sqrt(np.median(variances[used]))) if used.any() else float(np.pi)
+        return AngularAgreement(
+            angles_rad=angles, agrees=used & ~behind, level_rad=level, excess_rad=excesses
+        )
+    excess, agrees = _excess(residuals, covariances, behind, num_unknowns, used)
     level = _level(angles[used], num_unknowns, freedom)
-    return AngularAgreement(angles_rad=angles, agrees=agrees, level_rad=level, excess_rad=excess)
+    return AngularAgreement(
+        angles_rad=angles, agrees=agrees, level_rad=level, excess_rad=np.full(len(angles), excess)
+    )
 
 
 def own_covariances(measured: MeasuredGraph) -> FloatArray:

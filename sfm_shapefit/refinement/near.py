@@ -46,6 +46,7 @@ def stay_near(
         levels_deg=tuple(np.degrees(levels).tolist()),
         reset_nodes=np.empty(0, dtype=np.int64),
         posterior=fit_mixture(measured, locations).posterior,
+        variances=None,
     )
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 from sfm_shapefit.base.settings import Composed, explained, group, option
 from sfm_shapefit.solver.options import SolverOptions
 
-Objective = Literal["auto", "shapefit", "lud"]
+Objective = Literal["auto", "shapefit", "lud", "mixture"]
 
 
 @explained
@@ -18,14 +18,16 @@ class PlacementOptions(Composed):
         "auto",
         'Which program the locations come from. "auto" solves ShapeFit, certified, and LUD, which '
         "does not collapse on long chains, refines both and keeps the one that fits the angles "
-        'better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit.',
+        'better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit; '
+        '"mixture" places a bare graph where a mixture of noise levels has most evidence: for streets, pairs '
+        "of uneven noise and scenes that repeat themselves, in two to five times the time.",
     )
     refine: bool = option(
-        True, 'Refine the start robustly in the angles of the directions; only for "auto" and "lud".'
+        True, 'Refine the start robustly in the angles of the directions; not for "shapefit".'
     )
     solver: SolverOptions = group(SolverOptions)
 
     @property
     def refines(self) -> bool:
         """Whether the start is to be refined in angles."""
-        return self.refine and self.objective in ("auto", "lud")
+        return self.refine and self.objective != "shapefit"

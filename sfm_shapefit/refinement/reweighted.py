@@ -104,6 +104,17 @@ def solve_reweighted(
     return found if projected_length(measured.graph, found.locations) > 0.0 else None
 
 
+def solve_at_triangles(measured: MeasuredGraph, options: SolverOptions) -> Reweighted:
+    """Return ShapeFit at the posteriors that the triangles of a graph give its pairs, certified."""
+    graph = measured.graph
+    weighted = graph.with_weights(
+        graph.weights * np.maximum(weigh_by_triangles(graph).posterior, _LEAST_WEIGHT)
+    )
+    solved = solve(weighted, options, groups=measured.groups)
+    mixture = fit_mixture(measured, solved.locations)
+    return Reweighted(graph=weighted, solved=solved, refined=None, mixture=mixture)
+
+
 def can_be_reweighted(measured: MeasuredGraph) -> bool:
     """Return whether a graph has so many pairs that a minority of them may determine all that moves."""
     graph, groups = measured.graph, measured.groups

@@ -32,9 +32,16 @@ from sfm_shapefit.refinement.angular import (
 )
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture, own_variances
+from sfm_shapefit.refinement.mixture import Mixture, MixtureEnd
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
-from sfm_shapefit.refinement.reweighted import POOR_SHARE, Reweighted, can_be_reweighted, solve_reweighted
+from sfm_shapefit.refinement.reweighted import (
+    POOR_SHARE,
+    Reweighted,
+    can_be_reweighted,
+    solve_at_triangles,
+    solve_reweighted,
+)
 from sfm_shapefit.solver.options import PAIRS_AT_SCALE, SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.reduction import Reduction
@@ -51,6 +58,12 @@ _LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 
 _POINT_WEIGHT = 10.0  # LUD's weight of a direction to a 3D point; one loss there serves every noise
 _TIE = 1e-3  # relative difference of costs; a smaller one says nothing where the starts disagree
 _POINT_LENGTH = 1e-6  # share of the mean length of all pairs; the cameras of a shorter one stand in one place
+_EXPLAINED = 0.9  # share of the pairs; an answer that explains fewer may be a fold, and triangles are asked
+_POORLY_EXPLAINED = 0.35  # share of the pairs; below, posteriors are followed from solve to solve, too
+_NO_MIXTURE = (
+    "; not by a mixture of noise levels: that takes a bare graph, refined, of ten cameras or more that move "
+    "one by one, each in several pairs"
+)
 OPENING_RAD = 0.1
 """Largest width of the kernel, in radians, at which unrefined starts are compared; see `angular`."""
 
@@ -89,9 +102,9 @@ class RefinedPlacement:
     disagreement: float | None
     """Standard deviation of the log ratio of node lengths between the two starts; None with one start."""
     costs: dict[str, float]
-    """Robust cost of what each start led to, all at `levels_deg`."""
+    """Robust cost of what each start led to, all at `levels_deg`; under a mixture, minus its evidence."""
     levels_deg: tuple[float, ...]
-    """Noise level of each class of directions: between cameras, then from cameras to points."""
+    """Noise level of each class of directions: between cameras, then to points; a mixture's median."""
     moved: tuple[float, float]
     """Median and largest move of a node by the refinement, as a share of the median distance from the
     center."""
@@ -107,6 +120,8 @@ class RefinedPlacement:
     """(m,) probability that each direction is right, by its residual and those of all (`consensus`)."""
     reweighted: Reweighted | None
     """The program at other weights that the locations come from, certified; None where another was kept."""
+    variances: FloatArray | None = None
+    """(m,) variance per axis of each direction if it is right, rad^2; None where one level serves all."""
 
     @property
     def collapsed(self) -> bool:
@@ -115,7 +130,9 @@ class RefinedPlacement:
 
     @property
     def right(self) -> BoolArray | None:
-        """(m,) the directions that a reweighted start takes for right; None where most of all are."""
+        """(m,) the directions that are taken for right; None where most of all are."""
+        if self.variances is not None:
+            return np.asarray(self.posterior > 0.5)
         return None if self.reweighted is None else np.asarray(self.posterior > 0.5)
 
     def statement(self) -> str:
@@ -139,6 +156,12 @@ class _Problem(NamedTuple):
     measured: MeasuredGraph
     normal_solver: SymbolicFactor | LaplacianFactor | None
     """What the refinement solves its steps with; None where the starts are not refined."""
+    first: FloatArray
+    """(n, d) ShapeFit's optimum."""
+    second: FloatArray | None
+    """(n, d) LUD's."""
+    apart: float | None
+    """See `RefinedPlacement.disagreement`."""
 
 
 def refine_starts(
@@ -155,13 +178,57 @@ def refine_starts(
     """
     graph = measured.graph
     lud, second = _find_second_start(measured, options.solver.num_threads(), certified)
-    problem = _Problem(measured, _plan_normal_solver(measured, options) if options.refines else None)
-
     apart = None if second is None else disagreement(graph, solved.locations, second)
+    normal_solver = _plan_normal_solver(measured, options) if options.refines else None
+    problem, kept, note = _Problem(measured, normal_solver, solved.locations, second, apart), None, ""
+    if options.objective == "mixture":
+        options = replace(options, objective="auto")
+        kept = _find_most_evident(problem, options)
+        note = _NO_MIXTURE
+    if kept is None:
+        kept = _find_best_fit(problem, options)
+        kept = kept._replace(reason=kept.reason + note)
+    moved = _measure_moves(kept.start)
+    # To the bit: the certificate is that of these very locations.
+    is_as_solved = kept.start.locations is solved.locations and moved[1] == 0.0
+    return RefinedPlacement(
+        locations=solved.locations if is_as_solved else normalize_locations(graph, kept.start.best),
+        start=kept.start.name,
+        is_refined=moved[1] > 0.0,
+        reason=kept.reason,
+        disagreement=apart,
+        costs=kept.costs,
+        levels_deg=tuple(np.degrees(kept.levels).tolist()),
+        moved=moved,
+        num_turned_pairs=_count_turned_pairs(measured, kept.start, kept.levels),
+        reset_nodes=kept.start.reset_nodes,
+        lud=lud,
+        posterior=kept.posterior,
+        reweighted=kept.reweighted,
+        variances=kept.variances,
+    )
+
+
+class _Kept(NamedTuple):
+    """The answer among all starts; see `RefinedPlacement` for most."""
+
+    start: Start
+    reason: str
+    costs: dict[str, float]
+    levels: FloatArray
+    """(C,) radians."""
+    posterior: FloatArray
+    reweighted: Reweighted | None
+    variances: FloatArray | None = None
+
+
+def _find_best_fit(problem: _Problem, options: PlacementOptions) -> _Kept:
+    """Return the start that fits the angles best, or one at other weights where that fits far more pairs."""
+    measured, second, apart = problem.measured, problem.second, problem.apart
     is_iterative = isinstance(problem.normal_solver, IterativeNormal)
     # Refinements of so many are dear, and starts that are so near to one another lead to one place.
     near = _UNEQUAL if is_iterative else _SAME if measured.num_cameras >= _MANY_CAMERAS else 0.0
-    candidates = [("ShapeFit", solved.locations), *([] if second is None else [("LUD", second)])]
+    candidates = [("ShapeFit", problem.first), *([] if second is None else [("LUD", second)])]
     if apart is not None and apart > _UNEQUAL:
         # The likely better one comes first: the other ends early where it loses.
         candidates.reverse()
@@ -169,8 +236,8 @@ def refine_starts(
         candidates.pop()
     reweighted, refining = None, problem
     if is_iterative and options.objective == "auto":  # what the weights answer needs no other refinement
-        usual = fit_mixture(measured, candidates[0][1])
-        reweighted = _reweight(problem, candidates[0][1], usual, options)
+        mixture = fit_mixture(measured, candidates[0][1])
+        reweighted = _reweight(problem, candidates[0][1], mixture, options)
         refining = problem if reweighted is None else problem._replace(normal_solver=None)
     starts: list[Start] = []
     for name, locations in candidates:
@@ -178,35 +245,106 @@ def refine_starts(
         starts.append(_refine_start(refining, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(measured, starts)
     costs = {start.name: robust_cost(measured, start.best, levels) for start in starts}
-    chosen, reason = _choose(graph, starts, costs, apart, options)
+    chosen, reason = _choose(measured.graph, starts, costs, apart, options)
     if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
     if reweighted is None:
-        usual = fit_mixture(measured, chosen.best)
-        reweighted = _reweight(problem, chosen.best, usual, options)
+        mixture = fit_mixture(measured, chosen.best)
+        reweighted = _reweight(problem, chosen.best, mixture, options)
     if reweighted is not None:
-        chosen, reason = _start_of(reweighted), _explain(usual, reweighted)
+        chosen, reason = _start_of(reweighted), _explain(mixture, reweighted)
         if reweighted.refined is not None:
             levels = np.minimum(levels, reweighted.refined.levels_rad)
         costs[chosen.name] = robust_cost(measured, chosen.best, levels)
-    moved = _measure_moves(chosen)
-    # To the bit: the certificate is that of these very locations.
-    is_as_solved = chosen.locations is solved.locations and moved[1] == 0.0
-    return RefinedPlacement(
-        locations=solved.locations if is_as_solved else normalize_locations(graph, chosen.best),
-        start=chosen.name,
-        is_refined=moved[1] > 0.0,
-        reason=reason,
-        disagreement=apart,
-        costs=costs,
-        levels_deg=tuple(np.degrees(levels).tolist()),
-        moved=moved,
-        num_turned_pairs=_count_turned_pairs(measured, chosen, levels),
-        reset_nodes=chosen.reset_nodes,
-        lud=lud,
-        posterior=(usual if reweighted is None else reweighted.mixture).posterior,
-        reweighted=reweighted,
+    posterior = (mixture if reweighted is None else reweighted.mixture).posterior
+    return _Kept(chosen, reason, costs, levels, posterior, reweighted)
+
+
+class _Candidate(NamedTuple):
+    """A start, where its descent ended, and the program that it comes from, if that has other weights."""
+
+    name: str
+    start: FloatArray
+    end: MixtureEnd
+    reweighted: Reweighted | None = None
+
+
+def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | None:
+    """Return the end of most evidence under a mixture of noise levels; None if the graph has no such end."""
+    measured, plan = problem.measured, problem.normal_solver
+    is_bare = measured.evidence is None and measured.num_points == 0
+    if not (is_bare and isinstance(plan, SymbolicFactor) and can_be_reweighted(measured)):
+        return None
+    model = Mixture(measured, plan)
+    candidates = _descend_from_starts(model, problem, options)
+    if not candidates:
+        return None
+    best = max(candidates, key=lambda candidate: candidate.end.bound)
+    end = model.improve(best.end)
+    if projected_length(measured.graph, end.locations) <= 0.0:
+        return None
+    levels = np.array([np.sqrt(np.median(end.variances))])
+    refined = AngularResult(locations=end.locations, levels_rad=levels, cost=-end.bound, iterations=0)
+    start = Start(
+        name=best.name, locations=best.start, refined=refined, reset_nodes=np.empty(0, dtype=np.int64)
     )
+    of_starts = "the only start" if len(candidates) == 1 else f"most evidence of {len(candidates)} starts"
+    reason = f"{of_starts}, which explains {end.right_share:.0%} of the pairs by a mixture of noise levels"
+    if best.reweighted is not None:
+        reason += f"; {_say_certified(best.reweighted)}"
+    costs = {found.name: -found.end.bound for found in candidates}
+    return _Kept(start, reason, costs, levels, end.posterior, best.reweighted, end.variances)
+
+
+def _descend_from_starts(model: Mixture, problem: _Problem, options: PlacementOptions) -> list[_Candidate]:
+    """Return where the usual start leads to, and others where that leaves pairs unexplained."""
+    # ShapeFit's optimum collapses where the starts disagree, and LUD's cannot.
+    is_lud = problem.apart is not None and problem.apart > _UNEQUAL
+    name, start = ("LUD", problem.second) if is_lud else ("ShapeFit", problem.first)
+    assert start is not None
+    end = model.descend(start)
+    if end is None:
+        return []
+    candidates = [_Candidate(name, start, end)]
+    for other, weigh, share in (
+        ("ShapeFit at triangles", _by_triangles, _EXPLAINED),
+        ("reweighted ShapeFit", _by_posteriors, _POORLY_EXPLAINED),
+    ):
+        best = max(candidates, key=lambda candidate: candidate.end.bound).end
+        if best.right_share >= share or (found := weigh(problem, best, options)) is None:
+            continue
+        reweighted, start = found
+        end = model.descend(start)
+        if end is not None:
+            candidates.append(_Candidate(other, start, end, reweighted))
+    return candidates
+
+
+def _by_triangles(
+    problem: _Problem, _best: MixtureEnd, options: PlacementOptions
+) -> tuple[Reweighted, FloatArray]:
+    """Return ShapeFit at the posteriors that triangles give, and the start: it or LUD at them."""
+    graph = problem.measured.graph
+    found = solve_at_triangles(problem.measured, options.solver.at_scale(graph.num_edges))
+    if has_second_start(graph):
+        second = solve_lud(found.graph, _LUD_STEPS, certified=False).locations
+        if np.isfinite(second).all() and disagreement(graph, found.locations, second) > _UNEQUAL:
+            return found, second
+    return found, found.locations
+
+
+def _by_posteriors(
+    problem: _Problem, best: MixtureEnd, options: PlacementOptions
+) -> tuple[Reweighted, FloatArray] | None:
+    """Return the best ShapeFit at posteriors of residuals and triangles, in turn, and where it leads to."""
+    mixture = fit_mixture(problem.measured, best.locations)
+    found = _reweight(problem, best.locations, mixture, options)
+    return None if found is None else (found, found.locations)
+
+
+def _say_certified(reweighted: Reweighted) -> str:
+    """Say what the certificate of a program at other weights is of."""
+    return f"certified to {max(reweighted.solved.gap, 0.0):.1e} at weights that are the pairs' posteriors"
 
 
 def _reweight(
@@ -239,11 +377,8 @@ def _start_of(reweighted: Reweighted) -> Start:
 def _explain(usual: ResidualMixture, reweighted: Reweighted) -> str:
     """Say why a reweighted start is kept, and what its certificate is of."""
     before, after = usual.shares[0], reweighted.mixture.shares[0]
-    gap = max(reweighted.solved.gap, 0.0)
-    return (
-        f"the usual starts explain {before:.0%} of the pairs, this one {after:.0%}; "
-        f"certified to {gap:.1e} at weights that are the pairs' posteriors"
-    )
+    explained = f"the usual starts explain {before:.0%} of the pairs, this one {after:.0%}"
+    return f"{explained}; {_say_certified(reweighted)}"
 
 
 def _plan_normal_solver(

@@ -18,6 +18,7 @@ from sfm_shapefit.pairs import essential as relative_rotations
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline import doubts as doubts_stage
+from sfm_shapefit.pipeline import locate as locating
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs
 from sfm_shapefit.pipeline.inputs import inputs_from, see_matches
@@ -155,6 +156,7 @@ def test_of_very_many_pairs_only_those_of_turned_cameras_need_trials(monkeypatch
         tried.extend(matches.pairs.tolist())
         return trials(matches, are_many)
 
+    monkeypatch.setattr(locating, "tell_convention", lambda found, *_: found)  # which asks 200 at most
     monkeypatch.setattr(doubts_stage, "have_many_pairs", lambda *_: True)
     monkeypatch.setattr(relative_rotations, "_start_by_trials", trying)
     model, wrong = turned(COURTYARD, (9, 10, 11, 12, 13), 2.0)

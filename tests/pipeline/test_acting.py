@@ -74,7 +74,8 @@ def test_a_camera_goes_where_twice_as_many_pairs_put_it(ring_located, here, move
     found = replace(ring_located, evidence=ModelEvidence(places=(place,)))
     model = read_model(RING / "sparse" / "0")
     inputs, options = choose_inputs(RING / "sparse" / "0", DATABASE), LocateOptions()
-    with closing(open_matches(model, inputs)) as matches:
+    opened, inputs = open_matches(model, inputs)
+    with closing(opened) as matches:
         source = see_matches(matches, model.images, inputs, options)
         remedy = find_remedy(found, given_of(found, inputs), source, options)
         assert (remedy is not None) == moves

@@ -237,6 +237,8 @@ def test_gauge_the_first_by_precedence_sets_the_scale_and_the_others_check_it(fi
     if fixed:
         np.testing.assert_allclose(found[0], TRUTH.centers[0], atol=1e-9)
     said = list(rule.check(chosen, np.arange(8), found))
+    if fixed and "priors" in told:
+        assert "no part in origin and axes" in said.pop()
     words = [f"{one.split(' were')[0]} {one.split('differ by ')[1]}" for one in said]
     assert words == checks
 

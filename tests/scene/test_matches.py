@@ -259,6 +259,7 @@ def test_consumed_links_give_back_very_many_matches_and_what_was_yielded_stays(t
 
 def test_a_closed_database_is_read_no_more(tiny_ring, model):
     matches = open_database(tiny_ring / "database.db", model.images.names)
+    matches.forget()  # what was read when it was opened
     matches.close()
     matches.close()
     with pytest.raises(InputError, match="cannot be read"):

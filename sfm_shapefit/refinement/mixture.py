@@ -1,0 +1,347 @@
+"""Locations of most evidence under a mixture of noise levels: a refinement for pairs that differ in noise.
+
+The model. Direction e is right or wrong. A wrong one is uniform on the sphere. A right one is off by normal
+errors a_e of variance s_k^2 + own variance per axis: its own covariance where it states one, and s_k one of a
+fixed grid of levels, since pairs of one graph differ in noise by a factor of ten, and one level for all
+either rejects the noisy ones or believes wrong ones. Share w_0 of the pairs is wrong, w_k of level k.
+Lengths have a weak prior: cameras that share matches are about as far apart as others that do, whether or not
+their direction is right. All m pairs together count as n observations of it, one a camera:
+
+    (n / m)  sum_e log N(log |d_e|; mean, tau^2),    mean and tau those of the pairs themselves.
+
+What is maximized. Take the posterior of the locations for normal, N(T, S), and independent of which pair has
+which level. The best posterior of the levels for given T and S leaves the variational bound of the evidence
+
+    sum_e log( w_0 + sum_k w_k N(E a_e^2; s_k) / uniform )  +  prior(T)  +  log det(S) / 2,
+
+up to a constant, where each density has the mean E a_e^2 = a_e^2 + J_e S J_e' in the place of the square, J_e
+being the derivative of the error by the locations. A pair that a loose camera fits exactly is not believed
+for that: J_e S J_e' is how far that camera can go. A descent takes, in turn, the shares w by rounds of
+expectation maximization; T by a step of Levenberg and Marquardt at the information per pair that the
+posteriors of the levels give; and S, the inverse of the matrix of that step, of which the blocks of the pairs
+are needed alone (`laplacian.selected`). No level falls, only shares move: the model cannot collapse onto the
+few pairs that fit best.
+
+A floor under the levels falls from step to step, which draws a far start in (graduated non-convexity); the
+bound at its end decides between starts. The best end is left by `consensus` for places where more rays meet,
+as long as the bound grows.
+
+Sources: Bishop, "Pattern Recognition and Machine Learning", 2006, sections 10.1 and 10.2, for variational
+mixtures; Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020. The prior of
+lengths is our own.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import tangent_bases
+from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.scipy_parts import gammaln, logit
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.laplacian.cholesky import allocate_factor
+from sfm_shapefit.laplacian.selected import selected_inverse
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+from sfm_shapefit.refinement.consensus import put_by_consensus
+from sfm_shapefit.solver.program import adjoint, differences
+
+_LEVELS_RAD = np.geomspace(1e-7, 0.25, 22)
+"""Noise levels, radians, two of them a factor of 2 apart; noise below the first is none, beyond the last
+nothing is known of a direction."""
+_FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
+_NEXT_FLOOR_RAD = 0.01  # radians; after a consensus, which is nearer than a start
+_FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
+_NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
+_PSEUDO_WRONG, _PSEUDO_LEVEL = 1.0, 0.05  # pairs added to the count of each share; none may become 0
+_FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
+_SETTLED = 1e-4  # change of a share; a smaller one is none
+_TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
+_SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
+_SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
+_RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
+_DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
+_MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
+_LEAST_GAIN = 0.5  # nats; a smaller change of the bound is none
+_MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
+_ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
+_TYPICAL = 0.8  # share of the right pairs; the level that so many have at most serves a consensus
+_NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
+_LARGEST_VARIANCE = 1.0  # rad^2; a direction that nothing determines has no more
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MixtureEnd:
+    """Where a descent ends."""
+
+    locations: FloatArray
+    """(n, d) centered; the median length of an edge is 1."""
+    bound: float
+    """Lower bound of the log evidence, nats, up to a constant of the graph."""
+    posterior: FloatArray
+    """(m,) probability that each direction is right."""
+    variances: FloatArray
+    """(m,) variance per axis of the error of each direction if it is right, rad^2, own part included."""
+    shares: FloatArray
+    """(K + 1,) shares of wrong directions and of each level."""
+
+    @property
+    def right_share(self) -> float:
+        """Share of the directions that are right."""
+        return float(1.0 - self.shares[0])
+
+
+class _Residuals(NamedTuple):
+    """The directions at some locations (n, d)."""
+
+    locations: FloatArray
+    lengths: FloatArray  # (m,) floored
+    units: FloatArray  # (m, d) directions of the baselines
+    errors: FloatArray  # (m, d - 1) along the axes of the covariances, radians
+
+
+class _Noise(NamedTuple):
+    """The model of one step."""
+
+    shares: FloatArray  # (K + 1,)
+    floor: float  # radians; lower levels count as this one
+    variances: FloatArray  # (m, d - 1) rad^2, residuals by the locations
+    precision: float  # 1 / variance of a log length in the prior
+
+
+class _System(NamedTuple):
+    """The equations of one step."""
+
+    blocks: FloatArray  # (m, d, d) parts of the normal matrix
+    gradient: FloatArray  # (m, d) derivative of the cost by the baselines
+    damping_unit: FloatArray  # (m,)
+    cost: float  # minus the log of likelihood and prior
+
+
+class Mixture:
+    """The mixture model of a connected graph of cameras that move one by one."""
+
+    def __init__(self, measured: MeasuredGraph, plan: SymbolicFactor) -> None:
+        """Take a graph and the plan of its factor."""
+        graph = self._graph = measured.graph
+        d, bases = graph.dimension, tangent_bases(graph.directions)
+        self._own, self._axes = np.zeros((graph.num_edges, d - 1)), bases
+        if measured.covariance is not None:
+            known = np.isfinite(measured.covariance).all(axis=(1, 2), keepdims=True)
+            variances, turns = np.linalg.eigh(np.where(known, measured.covariance, 0.0))
+            self._own, self._axes = np.maximum(variances, 0.0), np.asarray(bases @ turns)
+        log_sphere = np.log(2.0) + 0.5 * d * np.log(np.pi) - gammaln(0.5 * d)
+        self._peak = float(np.exp(log_sphere - 0.5 * (d - 1) * np.log(2.0 * np.pi)))
+        self._factor = allocate_factor(plan, d)
+
+    def descend(self, start: FloatArray) -> MixtureEnd | None:
+        """Return where a descent from (n, d) locations ends; None if its equations are singular."""
+        count = len(_LEVELS_RAD)
+        return self._descend(start, _FIRST_FLOOR_RAD, np.r_[0.5, np.full(count, 0.5 / count)])
+
+    def improve(self, end: MixtureEnd) -> MixtureEnd:
+        """Return the end of most evidence that consensus and descents, in turn, lead to."""
+        for _ in range(_MOST_ROUNDS):
+            moved = self._put_by_consensus(end)
+            if np.array_equal(moved, end.locations):
+                break
+            found = self._descend(moved, _NEXT_FLOOR_RAD, end.shares)
+            if found is None or found.bound <= end.bound + _ROUND_GAIN:
+                break
+            end = found
+        return end
+
+    def _descend(self, start: FloatArray, floor: float, shares: FloatArray) -> MixtureEnd | None:
+        at, damping, bound, last = self._residuals(start), _DAMPING[0], -np.inf, None
+        variances = np.zeros_like(self._own)
+        for _ in range(_MOST_STEPS):
+            shares = self._fit(at.errors**2 + variances, shares, floor)
+            noise = _Noise(shares, floor, variances, self._precision(at.lengths))
+            system = self._equations(at, noise)
+            moved, damping = self._step(at, noise, system, damping)
+            if moved is None:
+                break
+            before, bound = bound, self._log_determinant(system, noise) - system.cost
+            last = at, noise, bound
+            if floor <= _NOISELESS_RAD and abs(bound - before) < _LEAST_GAIN:
+                break
+            variances, at = self._propagate(at), moved  # the variance of a residual hardly moves in a step
+            floor = max(floor * _FALL, float(_LEVELS_RAD[0]))
+        return None if last is None else self._judge(*last)
+
+    def _step(
+        self, at: _Residuals, noise: _Noise, system: _System, damping: float
+    ) -> tuple[_Residuals | None, float]:
+        """Return locations of less cost, the present ones where none are, None if the system is singular.
+
+        With them the damping for the next step; the factor stays that of the step.
+        """
+        right = -adjoint(system.gradient, self._graph.edges, self._graph.num_nodes)
+        while damping <= _DAMPING[2]:
+            if self._refactor(system, damping):
+                proposed = at.locations + self._factor.solve(right)
+                there = self._residuals(proposed)
+                if self._cost(there, noise) < system.cost:
+                    return there, max(damping / 10.0, _DAMPING[1])
+            damping *= 10.0
+        return at if self._refactor(system, _DAMPING[1]) else None, _DAMPING[0]
+
+    def _residuals(self, t: FloatArray) -> _Residuals:
+        """Return the errors of the directions at locations, which are centered and scaled."""
+        baselines, v = differences(t, self._graph.edges), self._graph.directions
+        lengths = np.linalg.norm(baselines, axis=1)
+        unit = max(float(np.median(lengths)), float(np.finfo(float).tiny))
+        floored = np.maximum(lengths / unit, _SHORTEST)
+        units = baselines / (unit * floored)[:, None]
+        angles = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(units - v, axis=1), 1.0))
+        errors = np.einsum("edk,ed->ek", self._axes, units)
+        sines = np.linalg.norm(errors, axis=1)
+        # Scaled to the angle, beyond 90 degrees too; straight behind, any axis will do.
+        behind = sines <= np.finfo(float).tiny
+        errors[behind, 0], sines[behind] = 1.0, 1.0
+        scaled = np.asarray((t - t.mean(axis=0)) / unit)
+        return _Residuals(scaled, floored, units, errors * (angles / sines)[:, None])
+
+    def _expect(
+        self, expected: FloatArray, shares: FloatArray, floor: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return information per axis (m, d - 1), log likelihood (m,), sums of the posteriors (K + 1,)."""
+        information, likelihood = np.empty_like(expected), np.empty(len(expected))
+        sums, weights = np.zeros_like(shares), shares * np.r_[1.0, np.full(len(_LEVELS_RAD), self._peak)]
+        levels = np.maximum(_LEVELS_RAD, floor)
+        _expect(expected, self._own, levels**2, weights, (information, likelihood, sums))
+        return information, likelihood, sums
+
+    def _fit(self, expected: FloatArray, shares: FloatArray, floor: float) -> FloatArray:
+        """Return the shares after some rounds of expectation maximization."""
+        for _ in range(_FIT_ROUNDS):
+            sums = self._expect(expected, shares, floor)[2]
+            sums += np.r_[_PSEUDO_WRONG, np.full(len(_LEVELS_RAD), _PSEUDO_LEVEL)]
+            last, shares = shares, sums / sums.sum()
+            if np.abs(shares - last).max() <= _SETTLED:
+                break
+        return shares
+
+    def _judge(self, at: _Residuals, noise: _Noise, bound: float) -> MixtureEnd:
+        """Return locations with the posterior that each direction is right, and its variance if it is."""
+        shares, tiny = noise.shares, np.finfo(float).tiny
+        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, shares, 0.0)
+        right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
+        variances = np.maximum(right, tiny) / np.maximum(information.mean(axis=1), tiny)
+        return MixtureEnd(
+            locations=at.locations,
+            bound=bound,
+            posterior=right,
+            variances=np.maximum(variances, _LEVELS_RAD[0] ** 2),
+            shares=shares,
+        )
+
+    def _precision(self, lengths: FloatArray) -> float:
+        logs = np.log(lengths)
+        tau = np.clip(_SPREAD * np.mean(np.abs(logs - np.median(logs))), *_TAUS)
+        return float(self._graph.num_nodes / len(logs) / tau**2)
+
+    def _cost(self, at: _Residuals, noise: _Noise) -> float:
+        likelihood = self._expect(at.errors**2 + noise.variances, noise.shares, noise.floor)[1]
+        return _prior_cost(at.lengths, noise.precision) - float(likelihood.sum())
+
+    def _equations(self, at: _Residuals, noise: _Noise) -> _System:
+        """Return the system of a step in the locations."""
+        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, noise.shares, noise.floor)
+        across, precision = self._across(at), noise.precision
+        along = at.units[:, :, None] * at.units[:, None, :]
+        blocks = (across * information[:, None, :]) @ across.transpose(0, 2, 1) + precision * along
+        blocks = blocks / at.lengths[:, None, None] ** 2
+        blocks += (_RIDGE * np.trace(blocks, axis1=1, axis2=2))[:, None, None] * np.eye(along.shape[1])
+        pull = np.einsum("edk,ek->ed", across, information * at.errors)
+        pull += (precision * _excess_logs(at.lengths))[:, None] * at.units
+        return _System(
+            blocks=blocks,
+            gradient=pull / at.lengths[:, None],
+            damping_unit=float(np.median(information)) / at.lengths**2,
+            cost=_prior_cost(at.lengths, precision) - float(likelihood.sum()),
+        )
+
+    def _across(self, at: _Residuals) -> FloatArray:
+        """Return the axes (m, d, d - 1) less what of them is along the baselines."""
+        along = np.einsum("edk,ed->ek", self._axes, at.units)
+        return np.asarray(self._axes - at.units[:, :, None] * along[:, None, :])
+
+    def _refactor(self, system: _System, damping: float) -> bool:
+        """Factor the damped normal matrix; return whether it is positive definite."""
+        resisting = (damping * system.damping_unit)[:, None, None] * np.eye(system.blocks.shape[1])
+        try:
+            self._factor.refactor(system.blocks + resisting)
+        except UnsolvableError:
+            return False
+        return True
+
+    def _log_determinant(self, system: _System, noise: _Noise) -> float:
+        """Return log det(S) / 2 of the present factor, in units of the prior's precision."""
+        n, d = self._graph.num_nodes, self._graph.dimension
+        ground = 2.0 * float(np.trace(system.blocks, axis1=1, axis2=2).sum()) / (d * n)  # as `refactor` adds
+        free = d * np.log(ground) + (d * (n - 1) - 1) * np.log(noise.precision)
+        return 0.5 * float(free - self._factor.log_determinant())
+
+    def _propagate(self, at: _Residuals) -> FloatArray:
+        """Return the variance of each residual by that of the locations, (m, d - 1), rad^2."""
+        i, j = self._graph.edges.T
+        inverse = selected_inverse(self._factor, self._graph.edges)
+        relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
+        across = self._across(at)
+        variances = np.sum(across * (relative @ across), axis=1) / at.lengths[:, None] ** 2
+        return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
+
+    def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
+        right = np.cumsum(end.shares[1:])
+        level = _LEVELS_RAD[min(np.searchsorted(right, _TYPICAL * right[-1]), len(_LEVELS_RAD) - 1)]
+        odds = np.full(len(self._own), logit(end.right_share))
+        return put_by_consensus(self._graph, end.locations, odds, level**2 + self._own.mean(axis=1))
+
+
+def _excess_logs(lengths: FloatArray) -> FloatArray:
+    """Return log lengths (m,) less their mean."""
+    logs = np.log(lengths)
+    return np.asarray(logs - logs.mean())
+
+
+def _prior_cost(lengths: FloatArray, precision: float) -> float:
+    """Return minus the log prior of lengths (m,)."""
+    return float(0.5 * precision * np.sum(_excess_logs(lengths) ** 2))
+
+
+@kernel
+def _expect(expected: Any, own: Any, levels2: Any, weights: Any, out: Any) -> None:
+    """Write the information per axis (m, k), the log likelihood (m,), and add up the posteriors (K + 1,).
+
+    `expected` (m, k) are mean squared errors along the axes of each direction, `levels2` ascending, `weights`
+    the shares, those of levels times the constant of the density, relative to that of wrong directions.
+    """
+    information, likelihood, sums = out
+    num_levels, num_axes = len(levels2), expected.shape[1]
+    terms = np.empty(num_levels)
+    for e in range(len(expected)):
+        total, density, lowest = weights[0], 0.0, 0
+        for k in range(num_levels - 1, -1, -1):
+            if k == num_levels - 1 or levels2[k] != levels2[k + 1]:
+                exponent, spread = 0.0, 1.0
+                for a in range(num_axes):
+                    variance = levels2[k] + own[e, a]
+                    exponent += expected[e, a] / variance
+                    spread *= variance
+                if exponent > _NEGLIGIBLE:  # and more so at lower levels
+                    lowest = k + 1
+                    break
+                density = np.exp(-0.5 * exponent) / np.sqrt(spread)
+            terms[k] = weights[k + 1] * density
+            total += terms[k]
+        sums[0] += weights[0] / total
+        information[e] = 0.0
+        for k in range(lowest, num_levels):
+            share = terms[k] / total
+            sums[k + 1] += share
+            for a in range(num_axes):
+                information[e, a] += share / (levels2[k] + own[e, a])
+        likelihood[e] = np.log(total)
