@@ -68,5 +68,6 @@ def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> L
     if recognized is None:
         return found
     others = tuple(reason for reason in found.suspicions if not reason.endswith(IS_ITS_DATABASE))
-    warnings = (recognized.sentence, *found.warnings)
+    first = recognized.sentence + ("; other warnings may come of that" if found.warnings else "")
+    warnings = (first, *found.warnings)
     return replace(found, recognized=recognized.clause, suspicions=others, warnings=warnings)

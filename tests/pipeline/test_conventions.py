@@ -99,6 +99,7 @@ def test_observations_in_another_resolution_are_said_with_their_ratio():
     assert told.reasons[0].startswith(f"points2D look scaled by 0.8, as those of pictures {size}")
     found = sfm_shapefit.locate(model, rotations=2.0)
     assert "scaled by 0.8" in found.warnings[0]
+    assert found.warnings[0].endswith("may come of that") == (len(found.warnings) > 1)
     assert found.verdict.grade is not Grade.GOOD
 
 
