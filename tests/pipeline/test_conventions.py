@@ -103,6 +103,19 @@ def test_observations_in_another_resolution_are_said_with_their_ratio():
     assert found.verdict.grade is not Grade.GOOD
 
 
+def test_a_database_of_pictures_in_another_resolution_is_said():
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    (camera,) = model.cameras.values()
+    size = f"pictures {camera.width} x {camera.height}"
+    camera.rescale(0.5)
+    with pytest.raises(UnsolvableError, match=f"{size} where the camera has {camera.width} x"):
+        sfm_shapefit.locate(model, RING / "database.db")
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = 0.5 * point.xy
+    assert size in check(model, RING / "database.db", second_opinion=False).verdict.reasons[0]
+
+
 def test_a_wrong_focal_length_is_no_resolution():
     model = pycolmap.Reconstruction(RING / "sparse" / "0")
     (camera,) = model.cameras.values()
