@@ -52,7 +52,7 @@ def cameras_of(path):
 GOOD = camera_of_model("OPENCV").params.tolist()
 
 
-@pytest.mark.parametrize("focal", [0.0, -500.0, np.nan, np.inf])
+@pytest.mark.parametrize("focal", [0.0, -500.0, np.nan, np.inf, 0.8, 1e6])
 @pytest.mark.parametrize("which", [(0, 1), (0,), (1,)])
 def test_a_guessed_focal_length_that_cannot_be_becomes_colmaps_guess(database, focal, which):
     put(database, 3, params=[focal if k in which else x for k, x in enumerate(GOOD)], prior_focal_length=0)
