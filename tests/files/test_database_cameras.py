@@ -94,7 +94,7 @@ def test_other_cameras_that_cannot_be_are_named_and_their_images_left_out(databa
         assert not cameras_of(database)[0].left_out
 
 
-@pytest.mark.parametrize(("width", "height"), [(0, 480), (640, -1), ("x", None)])
+@pytest.mark.parametrize(("width", "height"), [(0, 480), (640, -1), (None, 480)])
 def test_a_size_that_is_not_there_is_twice_the_principal_point(database, width, height):
     edit_database(
         database,
