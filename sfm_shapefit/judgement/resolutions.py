@@ -7,6 +7,7 @@ wrong focal length scales from the middle instead.
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.judgement.conventions import Recognized
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
@@ -16,6 +17,20 @@ _VANISHES = 0.25  # largest share of this error that is left at the right scale;
 _LEAST_CHANGE = 0.01  # relative change of the scale; sizes rounded to whole pixels make less
 _FAR = 0.25  # share of the picture; nearer to its corner, noise counts for more than the scale
 _MOST_IMAGES = 200  # images that are asked; a median needs no more
+
+
+def recognize_sizes(sizes_px: FloatArray, database_px: FloatArray) -> Recognized | None:
+    """Return in what size a database has the pictures; None if most are of the size (n, 2) of the cameras."""
+    differ = np.abs(database_px / sizes_px - 1.0).max(axis=1) > _LEAST_CHANGE  # false for NaN
+    if 2 * np.count_nonzero(differ) <= len(differ):
+        return None
+    first = int(np.argmax(differ))
+    own, other = (" x ".join(f"{length:.0f}" for length in sizes[first]) for sizes in (sizes_px, database_px))
+    return Recognized(
+        f"the database has keypoints of pictures {other} where the camera has {own} "
+        f"({np.count_nonzero(differ)} of {len(differ)} images)",
+        "bring both to one resolution",
+    )
 
 
 def recognize_resolution(points: Points, images: Images, pictures: Pictures) -> Recognized | None:

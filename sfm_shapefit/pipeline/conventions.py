@@ -8,11 +8,12 @@ import numpy as np
 
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.conventions import PoseFile, Recognized, recognize_convention
 from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, Grade
-from sfm_shapefit.judgement.resolutions import recognize_resolution
+from sfm_shapefit.judgement.resolutions import recognize_resolution, recognize_sizes
 from sfm_shapefit.pipeline.doubts import ask_rotations, rank_within
 from sfm_shapefit.pipeline.inputs import MatchSource
 
@@ -23,9 +24,14 @@ _MOST_PAIRS = 200  # pairs that are asked at all; a second
 def ask_convention(source: MatchSource, threads: int) -> Recognized | None:
     """Return the convention that the poses of a source look like; None if it is the one they are read by.
 
-    In rigs of several cameras, whose poses are of frames, none is recognized.
+    Pictures of another size in the database come first. In rigs of several cameras, whose poses are of
+    frames, no convention is recognized.
     """
     view, folder = source.view, source.inputs.folder
+    if isinstance(source.matches, DatabaseMatches):
+        sizes = recognize_sizes(source.images.sizes_px, source.matches.sizes_px())
+        if sizes is not None:
+            return sizes
     if source.images.has_rigs or not view.num_pairs:
         return None
     written: PoseFile = "model"
@@ -68,5 +74,6 @@ def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> L
     if recognized is None:
         return found
     others = tuple(reason for reason in found.suspicions if not reason.endswith(IS_ITS_DATABASE))
-    warnings = (recognized.sentence, *found.warnings)
+    first = recognized.sentence + ("; other warnings may come of that" if found.warnings else "")
+    warnings = (first, *found.warnings)
     return replace(found, recognized=recognized.clause, suspicions=others, warnings=warnings)

@@ -52,7 +52,7 @@ def cameras_of(path):
 GOOD = camera_of_model("OPENCV").params.tolist()
 
 
-@pytest.mark.parametrize("focal", [0.0, -500.0, np.nan, np.inf])
+@pytest.mark.parametrize("focal", [0.0, -500.0, np.nan, np.inf, 0.8, 1e6])
 @pytest.mark.parametrize("which", [(0, 1), (0,), (1,)])
 def test_a_guessed_focal_length_that_cannot_be_becomes_colmaps_guess(database, focal, which):
     put(database, 3, params=[focal if k in which else x for k, x in enumerate(GOOD)], prior_focal_length=0)
@@ -94,7 +94,7 @@ def test_other_cameras_that_cannot_be_are_named_and_their_images_left_out(databa
         assert not cameras_of(database)[0].left_out
 
 
-@pytest.mark.parametrize(("width", "height"), [(0, 480), (640, -1), (2.5, None)])
+@pytest.mark.parametrize(("width", "height"), [(0, 480), (640, -1), (2.5, None), (None, 480)])
 def test_a_size_that_is_not_there_is_twice_the_principal_point(database, width, height):
     edit_database(
         database,

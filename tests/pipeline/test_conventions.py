@@ -99,7 +99,21 @@ def test_observations_in_another_resolution_are_said_with_their_ratio():
     assert told.reasons[0].startswith(f"points2D look scaled by 0.8, as those of pictures {size}")
     found = sfm_shapefit.locate(model, rotations=2.0)
     assert "scaled by 0.8" in found.warnings[0]
+    assert found.warnings[0].endswith("may come of that") == (len(found.warnings) > 1)
     assert found.verdict.grade is not Grade.GOOD
+
+
+def test_a_database_of_pictures_in_another_resolution_is_said():
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    (camera,) = model.cameras.values()
+    size = f"pictures {camera.width} x {camera.height}"
+    camera.rescale(0.5)
+    with pytest.raises(UnsolvableError, match=f"{size} where the camera has {camera.width} x"):
+        sfm_shapefit.locate(model, RING / "database.db")
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = 0.5 * point.xy
+    assert size in check(model, RING / "database.db", second_opinion=False).verdict.reasons[0]
 
 
 def test_a_wrong_focal_length_is_no_resolution():

@@ -148,6 +148,18 @@ class DatabaseMatches(Matches):
         if self._sorted is not None:
             self._sorted.clear()
 
+    def sizes_px(self) -> FloatArray:
+        """Return the widths and heights (n, 2) in pixels of the images' cameras here; NaN if not known."""
+        cameras = (
+            "SELECT image_id, width, height FROM images JOIN cameras USING (camera_id) "
+            "WHERE typeof(width) = 'integer' AND width > 0 AND typeof(height) = 'integer' AND height > 0"
+        )
+        sizes = {image_id: size for image_id, *size in self.file.query(cameras)}
+        nothing = [np.nan, np.nan]
+        return np.array(
+            [sizes.get(self._ids.get(name, -1), nothing) for name in self.names], dtype=np.float64
+        )
+
     def keypoints(self, name: str) -> FloatArray:
         """Return the pixels (k, 2) of the keypoints of an image; zeros for one that is not finite."""
         return self._stored_pixels(name).astype(np.float64)

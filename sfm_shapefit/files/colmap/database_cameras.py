@@ -3,7 +3,7 @@
 A focal length, a coefficient or a size that cannot be (0, negative, NaN, infinite) is no reason to stop:
 
 - what was guessed (`prior_focal_length` is 0) becomes what COLMAP guesses: a focal length of 1.2 times the
-  larger side, the principal point in the middle, no distortion;
+  larger side, the principal point in the middle, no distortion; so does a guess in no unit of pixels;
 - what was stated leaves the images of that camera out;
 - a size that is not there is twice the principal point.
 
@@ -25,6 +25,8 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
 
 _LARGEST_SIDE = 2**31  # pixels; no image has such a side
 _GUESS = 1.2  # focal length over the larger side where none is known; COLMAP's default_focal_length_factor
+# Least and most focal length of a guess over the larger side; COLMAP's mapper takes 0.1 to 10 for possible.
+_LEAST_GUESS, _MOST_GUESS = 0.01, 100.0
 _COLUMNS = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
 
 
@@ -109,7 +111,8 @@ def _camera(model: Any, width: Any, height: Any, params: Any, prior: Any) -> tup
         said.append(f"its size {width!r} x {height!r} became {w} x {h}, twice its principal point")
     camera = pycolmap.Camera.create_from_model_name(1, name, _GUESS * max(w, h), w, h)
     camera.has_prior_focal_length, focal = bool(prior), camera.focal_length_idxs()
-    bad, what = _impossible(given, focal)
+    between = (0.0, np.inf) if prior or not focal else (_LEAST_GUESS * max(w, h), _MOST_GUESS * max(w, h))
+    bad, what = _impossible(given, focal, between)
     if bad.any():
         if prior and focal:
             raise ValueError(f"has the {what}")
@@ -119,14 +122,16 @@ def _camera(model: Any, width: Any, height: Any, params: Any, prior: Any) -> tup
     return camera, "; ".join(said)
 
 
-def _impossible(given: FloatArray, focal: Sequence[int]) -> tuple[BoolArray, str]:
+def _impossible(
+    given: FloatArray, focal: Sequence[int], between: tuple[float, float]
+) -> tuple[BoolArray, str]:
     """Return which parameters cannot be, and what they are; with a focal length the other one is not used.
 
-    Without focal lengths, all are lengths: width and height of a panorama.
+    Focal lengths lie between two values. Without them, all are lengths: width and height of a panorama.
     """
     bad = ~np.isfinite(given)
     lengths = list(focal) or slice(None)
-    bad[lengths] |= ~(given[lengths] > 0.0)
+    bad[lengths] |= ~((given[lengths] > between[0]) & (given[lengths] < between[1]))
     values = " and ".join(dict.fromkeys(f"{value:g}" for value in given[bad]))
     what = "focal length" if focal and set(np.flatnonzero(bad)) <= set(focal) else "parameters"
     bad[focal] = bad[focal].any()
