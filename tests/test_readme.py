@@ -142,7 +142,9 @@ def test_messages_that_troubleshooting_quotes_the_program_says():
 
 
 def test_the_docs_are_short_and_the_table_of_options_is_made_from_their_definitions():
-    assert sum(len(TEXTS[page].split()) for page in PAGES[1:]) <= 7100  # 100 for panoramas and systems on Earth
+    assert (
+        sum(len(TEXTS[page].split()) for page in PAGES[1:]) <= 7100
+    )  # 100 for panoramas and systems on Earth
     assert TEXTS[ROOT / "docs/options.md"].endswith(f"{options_table.table()}\n")
 
 
