@@ -7,15 +7,15 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.paths import refuse_irregular_file
 from sfm_shapefit.facts.placed import folder_of
-from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.facts.tables import CameraRow, PairRow, name_in, write_csv
+from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.rigidity import left_out_reasons
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import Judged
@@ -131,12 +131,9 @@ def covariance_of(row: CameraRow) -> FloatArray:
 
 def covariances_text(covariances: Mapping[str, FloatArray]) -> str:
     """Return covariances (3, 3) of centers, by the names of cameras, as a CSV; numbers round-trip."""
-    stream = io.StringIO()
-    has_return = any("\r" in name for name in covariances)  # which would end its line for others
-    quoting: Literal[0, 2] = csv.QUOTE_NONNUMERIC if has_return else csv.QUOTE_MINIMAL
-    writer = csv.writer(stream, lineterminator="\n", quoting=quoting)
-    writer.writerow(["name", *(first + second for first in "xyz" for second in "xyz")])
-    writer.writerows([name, *covariance.ravel().tolist()] for name, covariance in covariances.items())
+    stream, values = io.StringIO(), np.reshape(list(covariances.values()), (-1, 9)).T.tolist()
+    names = (first + second for first in "xyz" for second in "xyz")
+    write_csv({"name": list(covariances)} | dict(zip(names, values, strict=True)), stream)
     return stream.getvalue()
 
 
@@ -146,12 +143,10 @@ def read_covariances(path: Path) -> dict[str, FloatArray]:
     Raises:
         InputError: if the file cannot be read.
     """
-    refuse_irregular_file(path)
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            rows = [*csv.reader(stream)][1:]
-        return {name: np.array(cells, dtype=np.float64).reshape(3, 3) for name, *cells in rows}
-    except (OSError, ValueError, csv.Error) as error:
+        _, *rows = csv.reader(io.StringIO(text_of(path, keeps_returns=True), newline=""))
+        return {name_in(name): np.array(cells, dtype=np.float64).reshape(3, 3) for name, *cells in rows}
+    except (InputError, ValueError, csv.Error) as error:
         raise InputError(f"{path} is missing or damaged ({error}); run locate or map again") from error
 
 

@@ -7,10 +7,11 @@ import csv
 import io
 import itertools
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from sfm_shapefit.judgement.verdicts import Verdict
 
 TableName = Literal["cameras", "pairs"]
 Column = npt.NDArray[Any]
+_BYTE = re.compile(r"\\u(dc[89a-f][0-9a-f])")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +105,8 @@ def write_rows(
     rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int, path: Path
 ) -> None:
     """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
-    _write_csv(_values_of(rows, row_type, dimension), path)
+    with open_table(path) as stream:
+        write_csv(_values_of(rows, row_type, dimension), stream)
 
 
 def _values_of(
@@ -129,9 +132,14 @@ def read_trust(path: Path) -> dict[str, float]:
     """
     try:
         rows = csv.DictReader(io.StringIO(text_of(path, keeps_returns=True), newline=""))
-        return {cells["name"]: float(cells["trust"] or "nan") for cells in rows}
+        return {name_in(cells["name"]): float(cells["trust"] or "nan") for cells in rows}
     except (InputError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise InputError(f"{path} is damaged or of another version ({error}); run locate again") from error
+
+
+def name_in(cell: str) -> str:
+    """Return the name in a cell of a table, where bytes that are no UTF-8 are as `open_table` has them."""
+    return _BYTE.sub(lambda found: chr(int(found[1], 16)), cell)
 
 
 def columns_of_field(name: str, dimension: int) -> list[str]:
@@ -151,20 +159,25 @@ def axis_names(dimension: int) -> list[str]:
 
 def write_records(records: Sequence[Mapping[str, object]], path: Path) -> None:
     """Write records as CSV, at least one; numbers round-trip, NaN and None are empty fields."""
-    _write_csv({name: [record[name] for record in records] for name in records[0]}, path)
+    with open_table(path) as stream:
+        write_csv({name: [record[name] for record in records] for name in records[0]}, stream)
 
 
-def _write_csv(columns: Mapping[str, Sequence[object]], path: Path) -> None:
-    """Write columns under their names; bytes that are no UTF-8, as names may have, appear as \\udcXX."""
+def open_table(path: Path) -> TextIO:
+    """Open a table to be written; bytes that are no UTF-8, as names may have, appear as \\udcXX."""
+    return path.open("w", newline="", encoding="utf-8", errors="backslashreplace")
+
+
+def write_csv(columns: Mapping[str, Sequence[object]], stream: TextIO) -> None:
+    """Write columns under their names."""
     rows = zip(*map(_cells, columns.values()), strict=True)
-    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream:
-        bare = csv.writer(stream, lineterminator="\n")
-        quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
-        bare.writerow(columns)
-        if not any(map(_has_return, columns.values())):
-            bare.writerows(rows)
-        for row in rows:  # a carriage return ends a line for others, which `csv` forgets
-            (quoted if _has_return(row) else bare).writerow(row)
+    bare = csv.writer(stream, lineterminator="\n")
+    quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
+    bare.writerow(columns)
+    if not any(map(_has_return, columns.values())):
+        bare.writerows(rows)
+    for row in rows:  # a carriage return ends a line for others, which `csv` forgets
+        (quoted if _has_return(row) else bare).writerow(row)
 
 
 def _has_return(cells: Sequence[object]) -> bool:

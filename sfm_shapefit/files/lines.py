@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,32 +116,6 @@ def _split(line: str, separator: str) -> list[str]:
     except csv.Error:  # a cell longer than csv takes
         cells = line.split(separator)
     return [cell.strip() for cell in cells]
-
-
-def named_rows(
-    file: Path, widths: Collection[int], form: str
-) -> tuple[list[str], dict[str, tuple[str, FloatArray]]]:
-    """Return the header of a table, empty if it has none, and for each name its place and numbers.
-
-    Places are the begins of messages; a first line whose second cell is no number names the columns.
-
-    Raises:
-        InputError: as `text_of`, and if a line has another number of cells than one of `widths`, a cell that
-            is no number, or the name of an earlier one; `form` is what one should look like.
-    """
-    header: list[str] = []
-    rows: dict[str, tuple[str, FloatArray]] = {}
-    for place, (number, cells) in enumerate(lines_of_cells(file)):
-        where = f"{file}, line {number}: "
-        if place == 0 and len(cells) > 1 and not is_number(cells[1]):
-            header = cells
-            continue
-        if len(cells) not in widths or not all(map(is_number, cells[1:])):
-            raise InputError(f"{where}expected {form}")
-        if cells[0] in rows:
-            raise InputError(f"{where}{cells[0]} stands twice; keep one of its lines")
-        rows[cells[0]] = where, np.array([float(cell) for cell in cells[1:]])
-    return header, rows
 
 
 def first_words(file: Path) -> list[str]:

@@ -27,7 +27,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.files.json_node import JsonNode, read_json
 from sfm_shapefit.files.lines import text_of
-from sfm_shapefit.scene.images import Frames, Images, Sensors
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points
 
@@ -117,19 +117,11 @@ def _images(reconstruction: JsonNode) -> Images:
         lens_of.append(order[key])
         rotations.append(rotation)
         centers.append(-rotation.T @ np.array(shot.get("translation").numbers(3)))
-    ids = np.arange(1, len(names) + 1)
-    return Images(
-        names=tuple(names),
-        ids=ids,
-        frame_of=ids - 1,
-        lens_of=np.array(lens_of, dtype=np.int64),
-        frames=Frames(ids=ids, rotations=np.array(rotations), centers=np.array(centers)),
-        lenses=tuple(_lens(node, k) for k, (_, node) in enumerate(cameras, start=1)),
-        sensors=Sensors.references(len(cameras)),
-    )
+    poses = np.array(rotations), np.array(centers)
+    return Images.listed(names, poses, lens_of, [_lens(node) for _, node in cameras])
 
 
-def _lens(node: JsonNode, camera_id: int) -> Lens:
+def _lens(node: JsonNode) -> Lens:
     """Return a camera's lens in COLMAP's terms; missing coefficients are 0."""
     kind = node.get("projection_type").text()
     if kind not in _MODELS:
@@ -138,7 +130,7 @@ def _lens(node: JsonNode, camera_id: int) -> Lens:
     if width < 1 or height < 1:
         raise node.error("has no size")
     if _MODELS[kind] == "EQUIRECTANGULAR":
-        return Lens(_MODELS[kind], (float(width), float(height)), id=camera_id, width=width, height=height)
+        return Lens(_MODELS[kind], (float(width), float(height)), width=width, height=height)
     size = float(max(width, height))
 
     def value(key: str) -> float:
@@ -156,7 +148,7 @@ def _lens(node: JsonNode, camera_id: int) -> Lens:
         parameters = [fx, *parameters[2:6]]
     elif kind == "brown":
         parameters[6:] = [value("p1"), value("p2"), value("k3"), 0.0, 0.0, 0.0]
-    return Lens(_MODELS[kind], tuple(parameters), id=camera_id, width=width, height=height)
+    return Lens(_MODELS[kind], tuple(parameters), width=width, height=height)
 
 
 def _observations(file: Path, points: Sequence[str], names: Sequence[str]) -> tuple[IntArray, FloatArray]:

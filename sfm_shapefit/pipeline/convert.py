@@ -168,7 +168,7 @@ def _contents(name: str, scene: _Scene) -> dict[str, bytes]:
 
         return {"": glb_bytes(draw_model(scene.model, scene.trust))}
     if name == "covariances":
-        return {"": _covariances(scene).encode()}
+        return {"": _covariances(scene).encode(errors="backslashreplace")}
     module, _, function = FORMATS[name].text_of.partition(":")
     text_of = getattr(import_module(f"sfm_shapefit.files.{module}"), function)
     text: str = text_of(world.poses(images) if FORMATS[name].is_exact else images)

@@ -25,6 +25,7 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.verdicts import Hold, find_hold
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.placement.gauge import coincide
 from sfm_shapefit.placement.place import Near, Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
@@ -34,7 +35,6 @@ from sfm_shapefit.tracks.options import NodeOptions
 
 _FITTING = 0.95  # share of pairs that agree with a placement; from here on no other is tried
 _MOST_TRIED = 5_000  # nodes; more take seconds
-_COINCIDENT = 1e-9  # extent of fixed centers over their distance from the origin; less is rounding
 
 Place = Callable[[MeasuredGraph], Iterator[Placement]]
 
@@ -76,9 +76,7 @@ def find_rigid_parts(images: Images, fixed: BoolArray | None = None) -> Rigid:
     groups = frames if images.has_rigs else separate(images.num_images, 3)
     if count == 0:
         return Rigid(fixed, groups, None)
-    centers = images.centers[fixed]
-    extent = float(np.ptp(centers, axis=0).max())
-    if count > 1 and extent <= _COINCIDENT * max(1.0, float(np.abs(centers).max())) and not images.has_rigs:
+    if count > 1 and not images.has_rigs and coincide(images.centers[fixed]):
         raise InputError(
             f"the {count} fixed cameras stand at one place in the input; fix others, whose positions it has"
         )

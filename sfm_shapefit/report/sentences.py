@@ -216,4 +216,4 @@ def _unchecked(drawing: Drawing) -> Iterator[Hint]:
     count = int(np.sum(drawing.pairs.classes == PairClass.UNDETERMINED))
     if count:
         what = "1 pair" if count == 1 else f"{count:,} pairs"
-        yield Hint(text=f"{what} cannot be judged: unchecked by others, or in a piece that is not solved")
+        yield Hint(text=f"{what} cannot be judged: unchecked by others, in one frame, or outside the pieces")

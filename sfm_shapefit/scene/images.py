@@ -113,6 +113,26 @@ class Images:
         for name in ("ids", "frame_of", "lens_of"):
             object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=np.int64)))
 
+    @classmethod
+    def listed(
+        cls,
+        names: Sequence[str],
+        poses: tuple[FloatArray, FloatArray],
+        lens_of: Sequence[int],
+        lenses: Sequence[Lens],
+    ) -> "Images":
+        """Return images in frames of their own, posed by rotations and centers (i, 3), with ids from 1 on."""
+        ids = np.arange(1, len(names) + 1)
+        return cls(
+            names=tuple(names),
+            ids=ids,
+            frame_of=ids - 1,
+            lens_of=np.array(lens_of, dtype=np.int64),
+            frames=Frames(ids=ids, rotations=poses[0], centers=poses[1]),
+            lenses=tuple(replace(lens, id=k) for k, lens in enumerate(lenses, start=1)),
+            sensors=Sensors.references(len(lenses)),
+        )
+
     @property
     def num_images(self) -> int:
         """Number of images, i."""

@@ -12,6 +12,7 @@ import pytest
 
 from sfm_shapefit import check, evaluate, join, locate, map_database
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.tables import read_trust
 from sfm_shapefit.files.colmap.gravity import table_gravity
 from sfm_shapefit.files.colmap.images import name_of
 from sfm_shapefit.files.colmap.model import read_model
@@ -95,6 +96,9 @@ def test_names_that_are_no_utf8_go_through_every_command_as_bytes(tmp_path: Path
     for text in told:
         json.loads(text)
     assert r"\\xd0\\xc5_0001.jpg" in report.read_text(encoding="utf-8")
+    assert set(read_trust(out / "cameras.csv")) == {name.decode("utf-8", "surrogateescape") for name in names}
+    run("convert", out, tmp_path / "known.csv", "--format", "covariances", "-q", code=0)
+    assert (tmp_path / "known.csv").read_bytes() == (out / "covariances.csv").read_bytes()
     for target in ("poses.json", "poses.csv", "poses.tum", "scene.glb", "scene.ply"):
         run("convert", out, tmp_path / target, "-q", code=0)
         if target.startswith("poses"):

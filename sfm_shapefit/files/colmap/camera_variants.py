@@ -10,11 +10,13 @@ Sources: https://github.com/json87/SphereSfM (`camera_models.h`), https://github
 https://github.com/colmap/colmap/pull/4441.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import NamedTuple
 
 import pycolmap
+
+from sfm_shapefit.base.wording import first_of
 
 EQUIRECTANGULAR = "EQUIRECTANGULAR"
 _SPHERES = (EQUIRECTANGULAR, "SPHERE", "SPHERICAL", "OPENCV_SPHERICAL")
@@ -34,6 +36,15 @@ class CameraVariant(NamedTuple):
     """Parameters in COLMAP's order."""
     note: str = ""
     """What was read otherwise than it was written, without a subject; empty if nothing was."""
+
+
+def cameras_alike(said: Mapping[int, str]) -> Iterator[tuple[str, list[int], str]]:
+    """Yield cameras of which the same is said, as words and as ids, and that."""
+    ids_of: dict[str, list[int]] = {}
+    for camera_id, words in said.items():
+        ids_of.setdefault(words, []).append(camera_id)
+    for words, ids in ids_of.items():
+        yield f"{'cameras' if len(ids) > 1 else 'camera'} {first_of([str(i) for i in ids])}", ids, words
 
 
 @cache

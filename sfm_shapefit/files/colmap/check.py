@@ -51,9 +51,6 @@ from sfm_shapefit.files.colmap.text_model import binary_records
 from sfm_shapefit.files.model_folder import REQUIRED_FILES, model_suffix
 from sfm_shapefit.files.norms import may_be_rotations
 
-UNIT_QUATERNION_TOLERANCE = 1e-3
-"""A quaternion printed with 4 digits still passes; one farther off is normalized, and said."""
-
 _CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 _PIECE_BYTES = 2**22  # bytes of points3D.bin read at once; checking them takes ten times as much memory
 _IMAGES_AT_ONCE = 256  # images whose points are looked up at once; all 10,000 would take 200 MB

@@ -19,7 +19,7 @@ import pycolmap
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import counted_are, first_of
-from sfm_shapefit.files.colmap.camera_variants import num_params_of_model, read_camera
+from sfm_shapefit.files.colmap.camera_variants import cameras_alike, num_params_of_model, read_camera
 from sfm_shapefit.files.colmap.database_pairs import NO_ID
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
 
@@ -44,24 +44,15 @@ class DatabaseCameras(NamedTuple):
 
         `names` are those of the images of impossible cameras.
         """
-        for cameras, _, said in _alike(self.changed):
+        for cameras, _, said in cameras_alike(self.changed):
             yield f"{cameras} of the database: {said}"
-        for cameras, ids, why in _alike({i: self.impossible[i] for i in names}):
+        for cameras, ids, why in cameras_alike({i: self.impossible[i] for i in names}):
             lost = [name for camera_id in ids for name in names[camera_id]]
             each = ": each" if len(ids) > 1 else ""
             yield (
                 f"{cameras} of the database{each} {why}: {counted_are(len(lost), 'image')} left out "
                 f"({first_of(lost)}); correct that, or set prior_focal_length to 0 for COLMAP's guess"
             )
-
-
-def _alike(said: Mapping[int, str]) -> Iterator[tuple[str, list[int], str]]:
-    """Yield cameras of which the same is said, as words and as ids, and that."""
-    ids_of: dict[str, list[int]] = {}
-    for camera_id, words in said.items():
-        ids_of.setdefault(words, []).append(camera_id)
-    for words, ids in ids_of.items():
-        yield f"{'cameras' if len(ids) > 1 else 'camera'} {first_of([str(i) for i in ids])}", ids, words
 
 
 def read_cameras(file: DatabaseFile) -> DatabaseCameras:

@@ -18,10 +18,10 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
 from sfm_shapefit.files.colmap.images import sensor_id
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
+from sfm_shapefit.files.lines import UNIT_TOLERANCE
 
 _CAMERA = 0  # type of a sensor; COLMAP's number for cameras
 _POSE_BYTES = 7 * 8  # bytes of a pose; a quaternion and a translation in doubles
@@ -123,7 +123,7 @@ def _pose(path: Path, rig_id: int, blob: object) -> pycolmap.Rigid3d:
     if isinstance(blob, bytes) and len(blob) == _POSE_BYTES:
         values = np.frombuffer(blob, dtype="<f8").astype(np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
-        is_unit = abs(float(np.linalg.norm(values[:4])) - 1.0) <= UNIT_QUATERNION_TOLERANCE
+        is_unit = abs(float(np.linalg.norm(values[:4])) - 1.0) <= UNIT_TOLERANCE
     if not (is_unit and np.isfinite(values).all()):
         raise InputError(f"{path}: the pose of a sensor in rig {rig_id} is damaged; configure rigs again")
     return pycolmap.Rigid3d(pycolmap.Rotation3d(values[[1, 2, 3, 0]]), values[4:])

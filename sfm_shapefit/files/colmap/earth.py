@@ -10,10 +10,10 @@ that most of its rows lie in, by longitude alone, and 10,000 km of false northin
 import re
 
 import numpy as np
-import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.geodesy import earth
 from sfm_shapefit.scene.given import Datum
 
 _ECEF = 4978  # EPSG code; Earth-centered, Earth-fixed
@@ -43,7 +43,7 @@ def epsg_code(name: str, datum: Datum) -> int:
 
 def to_epsg(places: FloatArray, datum: Datum, code: int) -> FloatArray:
     """Return places (k, 3), in meters east, north and up of a datum, as coordinates of an EPSG code."""
-    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    transform = earth()
     if code == _ECEF:
         return np.asarray(transform.enu_to_ecef(places, *datum))
     geodetic = np.asarray(transform.enu_to_ellipsoid(places, *datum))

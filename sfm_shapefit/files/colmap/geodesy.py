@@ -46,7 +46,10 @@ def projection_named(line: str) -> Projection:
         return lambda xyz: (xyz[:, [1, 0, 2]], True)
     zone, is_north = _zone(named)
     if zone in _ZONES:
-        return lambda xyz: (_from_utm(xyz, zone, is_north), True)
+        return lambda xyz: (
+            np.asarray(earth().utm_to_ellipsoid(np.ascontiguousarray(xyz), zone, is_north)),
+            True,
+        )
     raise ValueError(
         f"the projection {line.strip()!r} is not one that is converted; give coordinates in EPSG:4326 "
         "(longitude, latitude, altitude), in a zone as WGS84 UTM 32N, or metric ones after the line local"
@@ -84,8 +87,7 @@ def enu_of(geodetic: FloatArray, datum: Datum) -> FloatArray:
         is_swapped = (latitudes <= 360.0).all() and (longitudes <= 90.0).all()
         remedy = "are they swapped?" if is_swapped else "give degrees"
         raise ValueError(f"a latitude or longitude is out of range; {remedy}")
-    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-    return np.asarray(transform.ellipsoid_to_enu(np.ascontiguousarray(geodetic), *datum))
+    return np.asarray(earth().ellipsoid_to_enu(np.ascontiguousarray(geodetic), *datum))
 
 
 def _plain(line: str) -> str:
@@ -103,6 +105,6 @@ def _zone(named: str) -> tuple[int, bool]:
     return (int(string[1]), "+south" not in named) if string and shapes <= {"wgs84", "m"} else (0, True)
 
 
-def _from_utm(xyz: FloatArray, zone: int, is_north: bool) -> FloatArray:
-    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-    return np.asarray(transform.utm_to_ellipsoid(np.ascontiguousarray(xyz), zone, is_north))
+def earth() -> pycolmap.GPSTransform:
+    """Return the transformations of the WGS84 ellipsoid."""
+    return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)

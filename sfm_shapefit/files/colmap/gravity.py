@@ -12,7 +12,7 @@ import numpy as np
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.priors import PRIORS_OF_IMAGES
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.files.lines import named_rows
+from sfm_shapefit.files.lines import is_number, lines_of_cells
 from sfm_shapefit.scene.given import Gravity
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
@@ -34,14 +34,22 @@ def table_gravity(path: Path, images: Images) -> Gravity:
         InputError: if the file cannot be read, a line is malformed, or no name is one of the model's.
     """
     rows: dict[str, list[float]] = {}
-    for name, (where, values) in named_rows(path, (4, 5), _FORM)[1].items():
-        length, sigma = float(np.linalg.norm(values[:3])), [*values, _SIGMA_DEG][3]
+    for place, (number, cells) in enumerate(lines_of_cells(path)):
+        where = f"{path}, line {number}: "
+        if place == 0 and len(cells) > 1 and not is_number(cells[1]):
+            continue
+        if len(cells) not in (4, 5) or not all(map(is_number, cells[1:])):
+            raise InputError(f"{where}expected {_FORM}")
+        if cells[0] in rows:
+            raise InputError(f"{where}{cells[0]} stands twice; keep one of its lines")
+        *direction, sigma = [*map(float, cells[1:]), _SIGMA_DEG][:4]
+        length = float(np.linalg.norm(direction))
         if not 1.0 / _LARGEST <= length <= _LARGEST or not _LEAST_SIGMA_DEG <= sigma < 90.0:
             raise InputError(
                 f"{where}the direction must be finite and not zero, the standard deviation between "
                 f"{_LEAST_SIGMA_DEG:g} and 90 deg"
             )
-        rows[name] = [*values[:3], sigma]
+        rows[cells[0]] = [*direction, sigma]
     same = same_images(list(rows), images.names)
     found = {k: row for k, row in zip(same.places.tolist(), rows.values(), strict=True) if k >= 0}
     if not found:

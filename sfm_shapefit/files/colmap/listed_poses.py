@@ -28,7 +28,7 @@ from sfm_shapefit.files.listed_names import find_images
 from sfm_shapefit.files.nerf import read_nerf
 from sfm_shapefit.files.opensfm import OpenSfmModel, read_opensfm
 from sfm_shapefit.files.tum import read_tum
-from sfm_shapefit.scene.images import Frames, Images, Sensors
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.listed_poses import ListedPoses
 
@@ -83,16 +83,9 @@ def read_by_itself(source: ModelSource, *, with_lenses: bool = False) -> ColmapM
             f"{file} has no whole lens of {name} (w, h, fl_x and a camera_model that is read); add it"
         )
     known = list(dict.fromkeys(lenses))
-    ids = np.arange(1, len(lenses) + 1)
-    images = Images(
-        names=tuple(_FOLDER.sub("", name.replace("\\", "/")) for name in poses.names),
-        ids=ids,
-        frame_of=ids - 1,
-        lens_of=np.array([known.index(lens) for lens in lenses], dtype=np.int64),
-        frames=Frames(ids=ids, rotations=poses.rotations, centers=poses.centers),
-        lenses=tuple(replace(lens, id=k) for k, lens in enumerate(known, start=1)),
-        sensors=Sensors.references(len(known)),
-    )
+    names = [_FOLDER.sub("", name.replace("\\", "/")) for name in poses.names]
+    lens_of = [known.index(lens) for lens in lenses]
+    images = Images.listed(names, (poses.rotations, poses.centers), lens_of, known)
     read = read_model(reconstruction_of(OpenSfmModel.without_points(images)))
     return replace(read, notes=(*poses.notes, *read.notes))
 

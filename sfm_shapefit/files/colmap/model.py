@@ -24,7 +24,6 @@ import pycolmap
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import counted, counted_are, first_of
 from sfm_shapefit.files.colmap.check import (
-    UNIT_QUATERNION_TOLERANCE,
     ContradictionError,
     binary_files,
     name_contradiction,
@@ -35,6 +34,7 @@ from sfm_shapefit.files.colmap.lenses import focal_lengths
 from sfm_shapefit.files.colmap.model_copies import with_own_cameras, without_points
 from sfm_shapefit.files.colmap.points import Observed, points2d_xy
 from sfm_shapefit.files.colmap.quiet import quiet_log
+from sfm_shapefit.files.lines import UNIT_TOLERANCE
 from sfm_shapefit.files.norms import are_off, say_normalized
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import names_among
@@ -261,7 +261,7 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, observed: 
     quaternions = np.array([pose.rotation.quat for pose in poses], dtype=np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         # Quaternions are unit up to rounding in a file.
-        sound = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= UNIT_QUATERNION_TOLERANCE
+        sound = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= UNIT_TOLERANCE
     if not sound.all():
         raise InputError(f"{label}: image {ids[int(np.argmin(sound))]} has no valid rotation")
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)

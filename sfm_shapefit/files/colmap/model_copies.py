@@ -9,8 +9,8 @@ import pycolmap
 
 from sfm_shapefit.base.atomic_folder import private_folder
 from sfm_shapefit.files.colmap.binary_records import COUNT, IMAGE, NO_POINT, POINT2D
+from sfm_shapefit.files.colmap.camera_variants import cameras_alike
 from sfm_shapefit.files.colmap.check import ModelFiles, check_cameras, write_binary_file
-from sfm_shapefit.files.colmap.text_model import say_variants
 
 
 @contextmanager
@@ -21,11 +21,8 @@ def with_own_cameras(files: ModelFiles) -> Iterator[ModelFiles]:
         InputError: as `walk_files` for the cameras.
     """
     cameras = check_cameras(files)
-    ids_of: dict[str, list[str]] = {}
-    for camera_id, camera in cameras.items():
-        if camera.read.note:
-            ids_of.setdefault(camera.read.note, []).append(str(camera_id))
-    if not ids_of:
+    changed = {camera_id: camera.read.note for camera_id, camera in cameras.items() if camera.read.note}
+    if not changed:
         yield files
         return
     write = pycolmap.Reconstruction()
@@ -38,7 +35,8 @@ def with_own_cameras(files: ModelFiles) -> Iterator[ModelFiles]:
     with private_folder() as own:
         write.write_binary(own)
         _link(files, own, "images", "points3D", "rigs", "frames")
-        yield files._replace(folder=own, notes=(*files.notes, *say_variants(ids_of)))
+        notes = (f"{alike} of the model: {note}" for alike, _, note in cameras_alike(changed))
+        yield files._replace(folder=own, notes=(*files.notes, *notes))
 
 
 @contextmanager

@@ -9,18 +9,16 @@ files beside a database in WAL mode. So a database is read
 """
 
 import os
-import secrets
 import shutil
 import sqlite3
 import struct
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sfm_shapefit.base.atomic_folder import locked_folder, remove_abandoned
+from sfm_shapefit.base.atomic_folder import private_folder
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.paths import refuse_irregular_file
 
@@ -263,13 +261,9 @@ def _fingerprint(path: Path) -> tuple[int, int]:
 def _private_copy(path: Path, stack: ExitStack) -> Path:
     """Copy a database with its -wal or -journal, and try again if a writer changed them meanwhile."""
     files = [path, *_sidecars(path)]
-    parent = Path(tempfile.gettempdir())
-    remove_abandoned(parent, ".shapefit-*.copy")
     for _ in range(_COPY_ATTEMPTS):
-        before = [_fingerprint(file) for file in files]
+        before, folder = [_fingerprint(file) for file in files], stack.enter_context(private_folder())
         try:
-            name = f".shapefit-{secrets.token_hex(8)}.copy"
-            folder = stack.enter_context(locked_folder(parent / name))
             for file in filter(Path.exists, files):
                 shutil.copyfile(file, folder / file.name)
         except OSError as error:

@@ -26,7 +26,6 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.files.colmap.binary_records import (
     CAMERA,
     COUNT,
@@ -40,7 +39,7 @@ from sfm_shapefit.files.colmap.binary_records import (
     RIG,
     SENSOR_ID,
 )
-from sfm_shapefit.files.colmap.camera_variants import num_params_of_model, read_camera
+from sfm_shapefit.files.colmap.camera_variants import cameras_alike, num_params_of_model, read_camera
 from sfm_shapefit.files.norms import may_be_rotations
 
 _EXACT = 2.0**53  # whole numbers; from here on floating-point numbers are not all of them
@@ -126,12 +125,6 @@ def binary_records(folder: Path) -> tuple[dict[str, Iterator[bytes]], list[str]]
     return {name: readers[name](_lines(path)) for name, path in files.items() if path.exists()}, notes
 
 
-def say_variants(ids_of: dict[str, list[str]]) -> Iterator[str]:
-    """Yield what of cameras was read otherwise than it stands, by the ids that each note is of."""
-    for note, ids in ids_of.items():
-        yield f"{'cameras' if len(ids) > 1 else 'camera'} {first_of(ids)} of the model: {note}"
-
-
 def _lines(path: Path) -> Iterator[_Line]:
     """Yield all lines of a text file; bytes that are no UTF-8 are those of names, and kept."""
     try:
@@ -151,7 +144,7 @@ def _records(lines: Iterable[_Line]) -> Iterator[_Line]:
 
 def _cameras(lines: Iterator[_Line], notes: list[str]) -> Iterator[bytes]:
     known = {name: (model_id, count) for model_id, (name, count) in num_params_of_model().items()}
-    variants: dict[str, list[str]] = {}
+    variants: dict[int, str] = {}
     for line in _records(lines):
         words = line.text.split()
         if len(words) < 4:
@@ -164,10 +157,10 @@ def _cameras(lines: Iterator[_Line], notes: list[str]) -> Iterator[bytes]:
         if read is None:
             raise line.fault("expected CAMERA_ID, a known camera MODEL, WIDTH, HEIGHT, PARAMS[]")
         if read.note:
-            variants.setdefault(read.note, []).append(words[0])
+            variants[camera_id] = read.note
         head = line.pack(CAMERA, camera_id, known[read.model][0], width, height)
         yield head + struct.pack(f"<{len(read.params)}d", *read.params)
-    notes += say_variants(variants)
+    notes += (f"{cameras} of the model: {note}" for cameras, _, note in cameras_alike(variants))
 
 
 def _images(lines: Iterator[_Line], notes: list[str]) -> Iterator[bytes]:
