@@ -6,6 +6,7 @@ it names.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -137,9 +138,9 @@ def write_converted(
         files[path.with_name(f"{path.stem}_offset.xyz")] = world.offset_line
     for file in files:  # before the first is written
         refuse_file(file, overwrite=overwrite, protect=protect)
-    for file, content in files.items():
-        with atomic_file(file) as partial:
-            partial.write_bytes(content)
+    with ExitStack() as whole:  # all are written before the first is in its place
+        for file, content in files.items():
+            whole.enter_context(atomic_file(file)).write_bytes(content)
     return Converted(name, tuple(files), told)
 
 

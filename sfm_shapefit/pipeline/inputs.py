@@ -12,6 +12,7 @@ from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
 from sfm_shapefit.facts.options import InspectOptions, PlacingOptions, Source
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, open_database
+from sfm_shapefit.files.colmap.database_cameras import read_cameras
 from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs, refuse_no_features
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
@@ -98,13 +99,14 @@ def open_matches(model: ColmapModel, inputs: Inputs) -> tuple[DatabaseMatches | 
 
 
 def open_verified(database: Path, names: Sequence[str]) -> DatabaseMatches:
-    """Open a database that has verified matches of some images, or of others.
+    """Open a database that has verified matches of some images, or of others, and cameras.
 
     Raises:
         InputError, UnsolvableError: if it cannot be used; the message says what is to be done first.
     """
     matches = open_database(database, names)
     try:
+        read_cameras(matches.file)  # which are asked for guesses when it is too late for other matches
         if not len(matches.pairs):
             refuse_no_features(matches.file)
             if explained := explain_no_pairs(matches.file):

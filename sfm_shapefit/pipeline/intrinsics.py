@@ -10,7 +10,7 @@ from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, intrinsics_in_doubt
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.intrinsics import Uncalibrated, calibrate_view_graph, find_uncalibrated
 from sfm_shapefit.files.colmap.pair_focals import PairFocal, read_pair_focals
-from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.pairs.focal_lengths import find_lenses
 from sfm_shapefit.scene.freedom import PARTS_FREED, IntrinsicsFreedom
 from sfm_shapefit.scene.images import Images
@@ -24,16 +24,17 @@ _MOST_OFF = 4.0  # factor; a view graph that wants a larger one says more of its
 
 def settle_intrinsics(
     images: Images,
-    file: DatabaseFile | None,
+    matches: DatabaseMatches | TrackMatches,
     wanted: IntrinsicsFreedom,
     left_out: PairNames = frozenset(),
     listed: frozenset[int] = frozenset(),
 ) -> tuple[Images, RefinedIntrinsics]:
     """Return the images to start from, lenses in doubt marked, and what adjustments may change of these.
 
-    The database, if there is one, says which intrinsics are guesses, and so are those of lenses whose ids are
-    `listed`; pairs that are left out say nothing of focal lengths.
+    The database of the matches, if they are of one, says which intrinsics are guesses, and so are those of
+    lenses whose ids are `listed`; pairs that are left out say nothing of focal lengths.
     """
+    file = matches.file
     guessed = {} if file is None else find_uncalibrated(file, images, listed)
     lenses, factors = list(images.lenses), np.ones(len(images.lenses))
     if wanted not in ("auto", "held"):
@@ -57,7 +58,7 @@ def settle_intrinsics(
             factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
         factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
         if by_rays.any():
-            view = DatabaseMatches(file, images.names).at(images.apart(), left_out)
+            view = matches.at(images.apart(), left_out)
             for k, seen in find_lenses(view, by_rays, doubted).items():
                 factors[k] = seen.focal_px / images.lenses[k].focal_px
                 lenses[k] = replace(lenses[k], parameters=seen.longer(1.0 / factors[k]).parameters)

@@ -97,7 +97,7 @@ def locate(
             opened, inputs = open_matches(model, inputs)
             matches = stack.enter_context(closing(opened))
             wanted = options.freedom.intrinsics
-            images, intrinsics = settle_intrinsics(given, matches.file, wanted, inputs.left_out, listed)
+            images, intrinsics = settle_intrinsics(given, matches, wanted, inputs.left_out, listed)
             known = read_known(images, matches.file, priors, options.gauge.control_points)
             rigid = find_rigid_parts(images, read_fixed_images(model, options.fix))
             if rigid.groups is not None:

@@ -47,10 +47,10 @@ def start_run(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Pat
         if options.freedom.rigs == "free" and not images.has_rigs:
             raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
         inputs = read_left_out(inputs_from(path), images.names, options.directions.without)
-        images, intrinsics = settle_intrinsics(images, file, options.freedom.intrinsics, inputs.left_out)
+        matches = DatabaseMatches(file, images.names)
+        images, intrinsics = settle_intrinsics(images, matches, options.freedom.intrinsics, inputs.left_out)
         gauge = between_images(options.gauge, images.names, "the database has no image")
         known = read_known(images, file, priors, options.gauge.control_points, options.averaging.gravity)
-        matches = DatabaseMatches(file, images.names)
     return MapRun(
         options=replace(options, gauge=gauge),
         clock=clock,

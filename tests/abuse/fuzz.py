@@ -168,7 +168,9 @@ def _judge(case, outcome, folder, before, expected):
     yield from (f"changed its input {name}" for name in kept if after.get(name) != before[name])
     if outcome.code == 3 and not case.may_fail:
         yield f"stopped by what it need not use: {outcome.stderr[:300]!r}"
-    new = {Path(name).parts[0] for name in after.keys() - before.keys()}
+    stem = Path(target).stem  # of what is written beside a file
+    beside = {f"{stem}_points.ply", f"{stem}_cameras{Path(target).suffix}"} if writes else set()
+    new = {Path(name).parts[0] for name in after.keys() - before.keys()} - beside
     if new != ({target} if writes and target not in before else set()):
         yield f"left {', '.join(sorted(new)) or 'nothing'} behind"
     yield from (f"left {name} behind" for name in after if name.startswith("tmp/"))

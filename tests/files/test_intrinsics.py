@@ -1,8 +1,11 @@
 """Which intrinsics were never measured, and the focal lengths that fundamental matrices know."""
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 
+from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.intrinsics import calibrate_view_graph, find_uncalibrated
@@ -12,7 +15,7 @@ from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
 from sfm_shapefit.scene.lens import FOCAL, Origin
 from tests.scenes import RING, copied, edit_database, fingerprint, read_from
 
-MODELS = {"SIMPLE_RADIAL": 2, "PINHOLE": 1, "OPENCV_FISHEYE": 5}
+MODELS = {"SIMPLE_RADIAL": 2, "PINHOLE": 1, "OPENCV_FISHEYE": 5, "FOV": 7, "EUCM": 16}
 
 
 def database_with(folder, model, params, prior):
@@ -20,6 +23,12 @@ def database_with(folder, model, params, prior):
     blob = np.array(params, dtype="<f8").tobytes().hex()
     change = f"UPDATE cameras SET model = {MODELS[model]}, params = x'{blob}', prior_focal_length = {prior}"
     return edit_database(copied(RING, folder) / "database.db", change)
+
+
+def settled(path, images, wanted, **how):
+    """Return what is started from, and what may change, by the matches of a database."""
+    with closing(open_database(path, images.names)) as matches:
+        return settle_intrinsics(images, matches, wanted, **how)
 
 
 @pytest.mark.parametrize(
@@ -31,6 +40,10 @@ def database_with(folder, model, params, prior):
         ("SIMPLE_RADIAL", [1150.0, 600.0, 450.0, 0.01], 1, None),
         ("SIMPLE_RADIAL", [1150.0, 601.0, 450.0, 0.0], 1, None),
         ("OPENCV_FISHEYE", [1150.0, 1150.0, 600.0, 450.0, 0.0, 0.0, 0.0, 0.0], 0, Origin.GUESS),
+        ("FOV", [1150.0, 1150.0, 600.0, 450.0, 0.01], 1, Origin.EXIF),
+        ("FOV", [1150.0, 1150.0, 600.0, 450.0, 0.0], 1, None),
+        ("EUCM", [1150.0, 1150.0, 600.0, 450.0, 0.0, 1.0], 1, Origin.EXIF),
+        ("EUCM", [1150.0, 1150.0, 600.0, 450.0, 0.6, 1.0], 1, None),
     ],
 )
 def test_what_was_never_measured_is_told_from_what_was(tmp_path, model, params, prior, origin):
@@ -40,10 +53,10 @@ def test_what_was_never_measured_is_told_from_what_was(tmp_path, model, params, 
     assert found == ({} if origin is None else {0: origin})
     # A model whose intrinsics are not the database's got them elsewhere.
     assert read_from(path, find_uncalibrated, read_model(RING / "sparse" / "0").images) == {}
-    marked, may_change = read_from(path, lambda file: settle_intrinsics(images, file, "auto"))
+    marked, may_change = settled(path, images, "auto")
     assert [lens.origin for lens in marked.lenses] == [origin]
     assert may_change.parts[:, FOCAL].tolist() == [origin is not None]
-    kept, stays = read_from(path, lambda file: settle_intrinsics(images, file, "held"))
+    kept, stays = settled(path, images, "held")
     assert [lens.origin for lens in kept.lenses] == [origin]
     assert kept.lenses[0].parameters == images.lenses[0].parameters
     assert not stays.parts.any()
@@ -86,10 +99,10 @@ def test_what_a_list_guesses_gives_way_to_what_the_view_graph_knows(tmp_path, li
     guess = images.lenses[0].longer(listed / 1150.0)
     images = images.with_lenses([guess])
     ids = frozenset({guess.id})
-    found, _ = read_from(path, lambda file: settle_intrinsics(images, file, "auto", listed=ids))
+    found, _ = settled(path, images, "auto", listed=ids)
     np.testing.assert_allclose(found.lenses[0].parameters, [1000.0, 1000.0, 600.0, 450.0], rtol=1e-4)
     edit_database(path, "UPDATE two_view_geometries SET config = 3, F = NULL")  # which then knows nothing
-    found, _ = read_from(path, lambda file: settle_intrinsics(images, file, "auto", listed=ids))
+    found, _ = settled(path, images, "auto", listed=ids)
     assert found.lenses[0].parameters == guess.parameters
 
 

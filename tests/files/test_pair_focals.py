@@ -7,9 +7,9 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.pair_focals import read_pair_focals
-from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pipeline import intrinsics
 from tests.lens_scene import camera_of_model, write_scene
 from tests.scenes import edit_database, read_from
@@ -81,7 +81,8 @@ def test_they_outweigh_the_view_graph_where_they_differ_from_it_by_more_than_the
     monkeypatch.setattr(
         intrinsics, "calibrate_view_graph", lambda *_: {i: px / GUESS_PX for i, px in asked.items()}
     )
-    with closing(DatabaseFile(scene[0])) as file:
-        images, _ = intrinsics.settle_intrinsics(read_images(file).images, file, "auto")
+    given = read_from(scene[0], read_images).images
+    with closing(open_database(scene[0], given.names)) as matches:
+        images, _ = intrinsics.settle_intrinsics(given, matches, "auto")
     found = [lens.focal_px for lens in images.lenses if lens.id in GUESSED]
     assert found == pytest.approx([500.0, 510.0, 500.0])

@@ -2,8 +2,9 @@
 
 COLMAP sets a focal length to 1.2 times the larger side of the image where it knows none, and to that of the
 EXIF data where there is one. The database calls the second a prior, but such a camera has never been
-calibrated either: its distortion is 0 in a model that has some, and its principal point the very middle of
-the image. Where most cameras of a database were calibrated, all were.
+calibrated either: all else is as COLMAP makes a camera, the principal point the very middle of the image and
+the distortion, of a model that has some, 0 (FOV .01, EUCM 0 and 1). Where most cameras of a database were
+calibrated, all were.
 
 A fundamental matrix knows the focal lengths of its two images (Fetzer, Reisert, Kanatani, "Stable intrinsic
 auto-calibration from fundamental matrices of devices with uncorrelated camera parameters", WACV 2020).
@@ -82,7 +83,7 @@ def find_uncalibrated(
     origins = [one.origin for one in found.values()]
     known = {Origin.CALIBRATION}
     if origins.count(Origin.EXIF) < origins.count(Origin.CALIBRATION):
-        # A calibration leaves the distortion 0 where the images do not tell it; EXIF leaves it 0 everywhere.
+        # A calibration leaves the distortion as it was where the images do not tell it; EXIF does everywhere.
         known.add(Origin.EXIF)
     return {number: one for number, one in found.items() if one.origin not in known}
 
@@ -91,10 +92,10 @@ def _origin(camera: pycolmap.Camera) -> Origin:
     """Return where the intrinsics of a camera of a database come from, by itself alone."""
     if not camera.has_prior_focal_length:
         return Origin.GUESS
-    principal = camera.params[camera.principal_point_idxs()]
-    extra = camera.params[camera.extra_params_idxs()]
-    is_centered = bool((principal == [0.5 * camera.width, 0.5 * camera.height]).all())
-    return Origin.EXIF if is_centered and len(extra) and not extra.any() else Origin.CALIBRATION
+    fresh = pycolmap.Camera.create_from_model_id(1, camera.model, 1.0, camera.width, camera.height)
+    others = slice(len(camera.focal_length_idxs()), None)  # principal point, and coefficients if it has any
+    is_untouched = bool((camera.params[others] == fresh.params[others]).all())
+    return Origin.EXIF if is_untouched and len(camera.extra_params_idxs()) else Origin.CALIBRATION
 
 
 def calibrate_view_graph(
