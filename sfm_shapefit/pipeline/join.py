@@ -116,7 +116,7 @@ def _read(
     every = {name for model in found for name in model.images.names}
     # A database that has all of them, each under its own name, says that they are different images.
     are_different = False
-    with suppress(InputError):  # of one that cannot be used is said later
+    with suppress(InputError):  # what is wrong with a database is said where it is opened for its matches
         are_different = database is not None and not _missing(database, every)
     for number, (source, model) in enumerate(zip(models, found, strict=True)):
         label = str(source) if isinstance(source, Path | str) else f"model {number}"
