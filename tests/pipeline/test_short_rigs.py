@@ -1,18 +1,14 @@
 """Rigs that are tiny beside their scene, seen through lenses that are guessed."""
 
 import numpy as np
-import pytest
 
 from sfm_shapefit.pipeline.map import map_database
-from tests.scenes import ROOT, edit_database
-
-KERRY_PARK = ROOT.parent / "shared/data/kerry-park/database.db"
+from tests.scenes import edit_database, real_scene
 
 
-@pytest.mark.skipif(not KERRY_PARK.exists(), reason="the park of fisheyes is not beside the project")
 def test_a_lens_without_distortion_that_is_guessed_is_found_before_the_rig_is_asked_for_a_scale(tmp_path):
     path = tmp_path / "database.db"
-    path.write_bytes(KERRY_PARK.read_bytes())
+    path.write_bytes((real_scene("kerry-park") / "database.db").read_bytes())
     guess = np.array([576.0, 576.0, 240.0, 240.0, 0.0, 0.0, 0.0, 0.0], dtype="<f8").tobytes().hex()
     edit_database(path, f"UPDATE cameras SET params = x'{guess}', prior_focal_length = 0")
     found = map_database(path)
