@@ -21,6 +21,7 @@ from sfm_shapefit.placement.place import ContradictedOffsetsError
 from sfm_shapefit.scene.lens import FOCAL, Origin
 
 _OPEN_SCALE = 0.5  # relative standard deviation; with a larger one the offsets may as well be 0
+_SHORT = 2e-3  # baselines; an offset as short turns a direction by a tenth of a degree, as its errors do
 
 
 class Remedy(NamedTuple):
@@ -60,12 +61,7 @@ def act(
     """
     found = _place_in_scale(place, given, source)
     if isinstance(found, str):
-        sensors = given.images.sensors
-        at_one = sensors.rotations, np.zeros_like(sensors.translations)
-        images = given.images.with_sensors(*at_one)
-        given = given._replace(images=images, rigid=find_rigid_parts(images, given.rigid.fixed))
-        source = source.at(source.images.with_sensors(*at_one))
-        again = act(place, given, source, options)
+        again = act(place, *at_one_center(given, source), options)
         return replace(again, warnings=(found, *again.warnings))
     remedy = find_remedy(found, given, source, options)
     if remedy is None:
@@ -74,6 +70,15 @@ def act(
     if not remedy.cures(again, found):
         return found
     return replace(again, warnings=(*remedy.told(again), *again.warnings))
+
+
+def at_one_center(given: Given, source: MatchSource) -> tuple[Given, MatchSource]:
+    """Return the same where the sensors of a rig share one center, so that nothing tells the scale."""
+    sensors = given.images.sensors
+    at_one = sensors.rotations, np.zeros_like(sensors.translations)
+    images = given.images.with_sensors(*at_one)
+    given = given._replace(images=images, rigid=find_rigid_parts(images, given.rigid.fixed))
+    return given, source.at(source.images.with_sensors(*at_one))
 
 
 def _place_in_scale(
@@ -89,8 +94,10 @@ def _place_in_scale(
         sigma = found.placement.scale_sigma
     except ContradictedOffsetsError as error:
         sigma = measure_hold(error.placement).scale_sigma
-        if not (longest > 0.0 and sigma > _OPEN_SCALE):
+        is_short = error.length > -_SHORT or sigma > _OPEN_SCALE
+        if not (longest > 0.0 and is_short):
             raise
+        sigma = np.inf
     if longest > 0.0 and sigma is not None and sigma > _OPEN_SCALE:
         return (
             f"the offsets of sensors in their rigs, at most {longest:.2g}, are too short for this scene to "

@@ -13,7 +13,7 @@ from sfm_shapefit.facts.map_result import MappedModel
 from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.scene import Loop
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.acting import act
+from sfm_shapefit.pipeline.acting import act, at_one_center
 from sfm_shapefit.pipeline.components import pairs_among
 from sfm_shapefit.pipeline.first_placement import adjust_first_placement, start_from_first
 from sfm_shapefit.pipeline.given import Given
@@ -22,6 +22,7 @@ from sfm_shapefit.pipeline.map_run import MapRun
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.settle import settle
 from sfm_shapefit.placement.gauge import UselessPriorsError
+from sfm_shapefit.placement.place import ContradictedOffsetsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.sequences import Visit
@@ -41,8 +42,12 @@ def refine_intrinsics(run: MapRun, relative: RelativeRotations) -> Images:
         given = _given(run, run.pose(members, averaging.rotations), run.inputs)
         source = see_matches(run.matches, given.images, run.inputs, run.options)
         with suppress(UnsolvableError):
+            find = partial(adjust_first_placement, options=run.options, clock=run.clock, lenses_wanted=True)
             with run.clock("first placement"):
-                first = adjust_first_placement(given, source, run.options, run.clock, lenses_wanted=True)
+                try:
+                    first = find(given, source)
+                except ContradictedOffsetsError:  # by directions of lenses that are not known yet
+                    first = find(*at_one_center(given, source))
             adjusted, rows = first.adjusted, run.images.lenses_of(first.adjusted.images)
             found = found.with_lenses_of(adjusted.images, adjusted.is_tried & ~is_found[rows])
             is_found[rows] |= adjusted.is_tried

@@ -151,10 +151,13 @@ class Placement(Displayed):
 class ContradictedOffsetsError(UnsolvableError):
     """The offsets inside rigid groups come out with no length, or a negative one."""
 
-    def __init__(self, message: str, placement: Placement) -> None:
-        """Keep the placement, which is right where offsets are too short to tell a scale."""
-        super().__init__(message)
-        self.placement = placement
+    def __init__(self, length: float, placement: Placement) -> None:
+        """Keep the offsets' length, in baselines, and the placement, right where they are too short."""
+        super().__init__(
+            "the directions contradict the known offsets between cameras: their scale comes out as "
+            f"{length:.1e} of a baseline; check the rigs, or which cameras are fixed"
+        )
+        self.length, self.placement = length, placement
 
 
 def place_pieces(
@@ -247,11 +250,7 @@ def _place_piece(
         unit=unit,
     )
     if not length > _LEAST_OFFSETS:
-        raise ContradictedOffsetsError(
-            "the directions contradict the known offsets between cameras: their scale comes out as "
-            f"{length:.1e} of a baseline; check the rigs, or which cameras are fixed",
-            placement,
-        )
+        raise ContradictedOffsetsError(length, placement)
     return placement
 
 

@@ -226,10 +226,18 @@ def _broken_outputs(place, again):
             ".html": content.endswith(b"</html>\n"),
             ".json": content.endswith(b"}\n") or content.endswith(b"}"),
             ".csv": content.endswith(b"\n") and content.count(b"\n") == 7,
+            ".ply": _is_whole_ply(content),
             ".glb": int.from_bytes(content[8:12], "little") == len(content),
         }
         if not whole[path.suffix]:
             yield f"{path.name} is not whole"
+
+
+def _is_whole_ply(content):
+    """Return whether points have the bytes that the header tells: three floats and a color each."""
+    header, _, body = content.partition(b"end_header\n")
+    count = header.partition(b"element vertex ")[2].split(b"\n")[0]
+    return count.isdigit() and len(body) == 15 * int(count)
 
 
 def cold_signals(number, moments, bench):
