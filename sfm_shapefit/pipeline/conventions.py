@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.points import ModelPictures
@@ -19,6 +20,8 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 
 _FIRST_PAIRS = 3  # pairs of each image; those with most matches are asked
 _MOST_PAIRS = 200  # pairs that are asked at all; a second
+_LEAST_AGREEING = 0.75  # share of the pairs; in another convention nearly all contradict
+_MOST_TURNED_DEG = 5.0  # degrees; other conventions are off by tens
 
 
 def ask_convention(source: MatchSource, threads: int) -> Recognized | None:
@@ -68,9 +71,18 @@ def naming_convention(source: MatchSource, threads: int) -> Iterator[None]:
         raise
 
 
+def _are_rotations_doubtful(found: LocateResult, source: MatchSource) -> bool:
+    """Return whether matches turned most of the given rotations, or many pairs contradict the result."""
+    if isinstance(source.matches, TrackMatches) or not found.agreeing_pairs >= _LEAST_AGREEING:
+        return True
+    turned = found.images.rotations @ source.images.rotations.transpose(0, 2, 1)
+    return not float(np.nanmedian(rotation_angles_deg(turned))) <= _MOST_TURNED_DEG
+
+
 def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> LocateResult:
     """Return a result that is not good with the convention that its input is in, if that can be told."""
-    recognized = None if found.verdict.grade is Grade.GOOD else _ask_input(source, threads)
+    is_asked = found.verdict.grade is not Grade.GOOD and _are_rotations_doubtful(found, source)
+    recognized = _ask_input(source, threads) if is_asked else None
     if recognized is None:
         return found
     others = tuple(reason for reason in found.suspicions if not reason.endswith(IS_ITS_DATABASE))
