@@ -380,7 +380,8 @@ class CheckedFacts(FactsOfModel):
         is_as_map_has_it = second is not None and not (
             second.wrong or second.undecided or second.has_nothing_in_common
         )
-        if self.verdict.grade is Grade.GOOD or (self.verdict.grade is Grade.LOOK and is_as_map_has_it):
+        is_sound = self.verdict.grade is Grade.GOOD or (self.verdict.grade is Grade.LOOK and is_as_map_has_it)
+        if is_sound and self.num_points:  # poses alone, as of a list, are to be placed with points
             step = next_of_model(self.verdict.grade, self)
             return step._replace(command=step.command.format(out=path, out_dense="dense"))
         if second is not None and second.wrong:
