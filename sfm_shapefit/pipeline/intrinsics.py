@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, intrinsics_in_doubt
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.intrinsics import Uncalibrated, calibrate_view_graph, find_uncalibrated
 from sfm_shapefit.files.colmap.pair_focals import PairFocal, read_pair_focals
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.pairs.focal_lengths import find_lenses
 from sfm_shapefit.scene.freedom import PARTS_FREED, IntrinsicsFreedom
@@ -48,15 +50,7 @@ def settle_intrinsics(
     if file is not None and guessed and wanted != "held":
         doubted = np.isin(np.arange(len(lenses)), list(guessed))
         by_rays = doubted & [lens.is_adjustable and not lens.is_plane for lens in lenses]
-        others = [found.database_id for k, found in guessed.items() if not by_rays[k]]
-        by_database = calibrate_view_graph(file, others, left_out) if others else {}
-        for i, one in by_pairs.items():
-            known = by_database.get(i)
-            if known is None or (one.is_one_sided and not 1.0 / _ALIKE < one.factor / known < _ALIKE):
-                by_database[i] = one.factor
-        for k, found in guessed.items():
-            factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
-        factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
+        factors = _by_view_graph(file, guessed, by_pairs, by_rays, left_out)
         if by_rays.any():
             view = matches.at(images.apart(), left_out)
             for k, seen in find_lenses(view, by_rays, doubted).items():
@@ -70,6 +64,27 @@ def settle_intrinsics(
         file.notes += _contradicted_guesses(images.lenses, lenses, guessed, by_pairs)
     parts = np.array(may_move, dtype=np.bool_) & np.isin(list(PARTS), PARTS_FREED[wanted])
     return images.with_lenses(lenses), intrinsics_in_doubt(parts, by_view_graph)
+
+
+def _by_view_graph(
+    file: DatabaseFile,
+    guessed: Mapping[int, Uncalibrated],
+    by_pairs: Mapping[int, PairFocal],
+    by_rays: BoolArray,
+    left_out: PairNames,
+) -> FloatArray:
+    """Return by which factor each lens (l,) is to be longer, 1 where no pair says."""
+    others = [found.database_id for k, found in guessed.items() if not by_rays[k]]
+    by_database = calibrate_view_graph(file, others, left_out) if others else {}
+    for i, one in by_pairs.items():
+        known = by_database.get(i)
+        if known is None or (one.is_one_sided and not 1.0 / _ALIKE < one.factor / known < _ALIKE):
+            by_database[i] = one.factor
+    factors = np.ones(len(by_rays))
+    for k, found in guessed.items():
+        factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
+    factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
+    return factors
 
 
 def _contradicted_guesses(
