@@ -128,8 +128,9 @@ def _find_apart(evidence: ModelEvidence) -> tuple[list[int], str]:
     """Return the cameras that stand apart, and a clause on how many ({}) do."""
     loose, second = [group.cameras for group in evidence.untied if group.is_loose], evidence.second
     groups = [*(seam.cameras for seam in evidence.seams), *loose]
-    if second is not None and len(second.wrong) > 1:  # which tells where the seam of these runs
+    if second is not None and len(second.wrong) + len(second.undecided) > 1:  # which tell where seams run
         groups = [g if second.has_most_alike(g) else np.setdiff1d(g, second.alike) for g in groups]
+    if second is not None and len(second.wrong) > 1:
         groups.insert(0, second.wrong)
     clause = (
         "nothing says how {} stand to the rest"
