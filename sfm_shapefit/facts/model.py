@@ -16,7 +16,7 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted, rounded
+from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
 from sfm_shapefit.facts.evidence import ToldEvidence, ToldOpinion
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics, describe_intrinsics
@@ -36,7 +36,6 @@ from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
 from sfm_shapefit.facts.scene import DistanceFacts, Loop, describe_line, describe_loops
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.judgement.reasons import Grade, Kind
-from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.placement.place import Placement
 
@@ -246,6 +245,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         dict[str, int],
         "Pairs by what became of them: usable, outlier, too_few_matches, few_inliers, no_parallax ...",
     ]
+    num_contradicting: Annotated[int, "Usable pairs that are set aside, and off by a degree or more."]
     agreement: Annotated[EvidenceShares, "What share of the evidence agrees."]
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
     scale_sigma: Annotated[
@@ -332,7 +332,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         turned = self.rotation_refinement
         is_given = turned is not None and self.inputs.model != IN_MEMORY
         rotations = turned.statement if turned and is_given else ""
-        lines = self.told_lines((self.pairs["outlier"], self.pairs["usable"]), rotations)
+        lines = self.told_lines((self.num_contradicting, self.pairs["usable"]), rotations)
         return Telling(lines, rows, details, step=self.next_step)
 
     def _pair_lines(self) -> list[str]:
@@ -425,13 +425,14 @@ class CheckedFacts(FactsOfModel):
     def told(self, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Telling:
         """Return what the terminal says, of cameras what is weak about them."""
         # One that the second opinion confirms is not told, whatever its weakness.
-        doubted = (row for row in cameras if not row.placed or row.name in self.verdict.cameras)
+        doubted = (row for row in cameras if row.placed and row.name in self.verdict.cameras)
         weak = [f"{row.name}: {row.reason}" for row in doubted if row.reason]
-        judged = [pair.verdict for pair in pairs if pair.direction]  # the others say nothing of positions
-        lines = self.told_lines((judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
+        absent = first_of([row.name for row in cameras if not row.placed])
+        judged = [pair for pair in pairs if pair.direction]  # the others say nothing of positions
+        lines = self.told_lines((sum(pair.contradicts for pair in judged), len(judged)))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
         notes = Row("warning", [one for one in self.warnings if one not in self.evidence.statements])
-        rows = [Row("weak", weak), second, notes]
+        rows = [Row("weak", weak), row("without a pose", absent), second, notes]
         return Telling(lines, rows, elsewhere="see the report", step=self.next_step)
 
 

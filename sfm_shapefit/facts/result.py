@@ -74,6 +74,7 @@ from sfm_shapefit.solver.options import SolverResult
 if TYPE_CHECKING:
     import pycolmap
 
+NO_POINTS = "no 3D point could be triangulated"
 NO_SUPPORT = "hardly any of its matches makes a point with a third image: its pose is wrong"
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 CARRIED_FIXED = "fixed; no pair of it takes part"
@@ -255,6 +256,7 @@ class LocateResult(_Placed):
             few_points={self.images.names[camera]: count for camera, count in self.few_points.items()},
             pairs={status.name.lower(): count for status, count in self.directions.counts().items()}
             | {"outlier": len(placement.rejected_pairs)},
+            num_contradicting=placement.num_contradicting,
             agreement=EvidenceShares(
                 pairs=self.agreeing_pairs,
                 observations=self.observations.agreeing,
@@ -315,7 +317,8 @@ class LocateResult(_Placed):
         )
         repeats = tuple(match_warnings(self.directions))[:1]
         repeated = (Reason(kind=Kind.REPEATED, sentence=sentence) for sentence in repeats)
-        after = (*repeated, *self._off_priors(), *self.suspicions)
+        lacks = () if self.model.num_points3D() else (Reason(kind=Kind.POINTS, sentence=NO_POINTS),)
+        after = (*repeated, *self._off_priors(), *lacks, *self.suspicions)
         return judge_model(self.placement, shares, before, after).led_by(self.recognized)
 
     def _off_priors(self) -> Iterator[Reason]:
