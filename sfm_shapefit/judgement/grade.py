@@ -56,7 +56,7 @@ from sfm_shapefit.judgement.limits import (
     SMALLEST_SHAPE,
     SURE_SIGMAS,
 )
-from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each
+from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -94,13 +94,13 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     if apart:
         clause = clause.format(f"{len(apart)} of {counted(count, 'camera')}")
         grade = Grade.DO_NOT_USE if len(set(apart) - confirmed) > FEW * count else Grade.LOOK
-        yield Reason(kind=Kind.APART, sentence=clause, images=names(apart), grade=grade)
+        yield of_model(Kind.APART, clause, grade, names(apart))
     if evidence.num_held is not None and evidence.num_held < HALF * count:
         clause = f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}"
-        yield Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE)
+        yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
     if len(named - confirmed) > MANY * count and len(named) > len(apart):
         clause = f"evidence speaks against {len(named)} of {counted(count, 'camera')}"
-        yield Reason(kind=Kind.PLACE, sentence=clause, grade=Grade.DO_NOT_USE)
+        yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
     elsewhere = "it stands elsewhere in the model that map made of the same database"
     wrong = [camera for camera in wrong if camera not in apart]
     yield from of_each(Kind.SECOND_OPINION, names(wrong), f"{elsewhere}, which pairs support")
@@ -108,20 +108,20 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     yield from of_each(Kind.PLACE, names(places), "pairs agree on another place of it")
     if lenses:
         clause = f"images contradict {counted(len(lenses), 'focal length')}"
-        yield Reason(kind=Kind.LENS, sentence=clause, images=names(through.tolist()))
+        yield of_model(Kind.LENS, clause, images=names(through.tolist()))
     for one in evidence.contradicted:
         clause = f"{one.num_against} of its {one.num_pairs} pairs contradict where it stands"
         yield from of_each(Kind.PAIRS, names([one.camera]), clause)
     unchecked = [k for group in evidence.untied for k in group.cameras.tolist() if k not in apart]
     if unchecked:
         clause = "nothing checks how groups of cameras stand to one another"
-        yield Reason(kind=Kind.UNCHECKED, sentence=clause, images=names(unchecked))
+        yield of_model(Kind.UNCHECKED, clause, images=names(unchecked))
     if second is not None:
         clause = "at least half as much speaks for another place or rotation of it"
         yield from of_each(Kind.SECOND_OPINION, names(second.ambiguous.tolist()), clause)
         if second.has_nothing_in_common:
             clause = "the model that map makes of the same database has another shape"
-            yield Reason(kind=Kind.APART, sentence=clause)
+            yield of_model(Kind.APART, clause)
 
 
 def _find_apart(evidence: ModelEvidence) -> tuple[list[int], str]:
@@ -132,11 +132,9 @@ def _find_apart(evidence: ModelEvidence) -> tuple[list[int], str]:
         groups = [g if second.has_most_alike(g) else np.setdiff1d(g, second.alike) for g in groups]
     if second is not None and len(second.wrong) > 1:
         groups.insert(0, second.wrong)
-    clause = (
-        "nothing says how {} stand to the rest"
-        if len(loose) == len(groups)
-        else "{} stand apart from the rest"
-    )
+    clause = "{} stand apart from the rest"
+    if len(loose) == len(groups):
+        clause = "nothing says how {} stand to the rest"
     return list(dict.fromkeys(camera for group in groups for camera in group.tolist())), clause
 
 
@@ -144,7 +142,7 @@ def too_few_to_judge(num_cameras: int) -> Iterator[Reason]:
     """Yield that nothing checks a model, if it has so few cameras."""
     if num_cameras < SMALLEST_SHAPE:
         clause = "it has two cameras only, so that nothing checks their poses and lenses"
-        yield Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED)
+        yield of_model(Kind.UNCHECKED, clause, Grade.CANNOT_BE_JUDGED)
 
 
 def judge_graph(placement: Judged) -> ModelVerdict:
@@ -152,10 +150,9 @@ def judge_graph(placement: Judged) -> ModelVerdict:
     level, assessment, reasons = placement.assessment.level_deg, placement.assessment, list[Reason]()
     if level > MOST_LEVEL_DEG:
         clause = f"the directions are {level:.0f} degrees off the cameras"
-        reasons.append(Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE))
+        reasons.append(of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE))
     if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
-        clause = "no pair is checked by others"
-        reasons.append(Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED))
+        reasons.append(of_model(Kind.UNCHECKED, "no pair is checked by others", Grade.CANNOT_BE_JUDGED))
     return judge_model(placement, Shares(), reasons)
 
 
@@ -170,61 +167,44 @@ def judge_model(
         before: what else speaks against the model, whose cameras are named first.
         after: the same, named last.
     """
-    return ModelVerdict.weigh(
-        [
-            *_reasons_against(shares),
-            *before,
-            *_doubtful_cameras(placement),
-            *after,
-            *_reasons_to_look(placement, shares),
-        ]
-    )
+    second = placement.second_configuration is not None
+    repeated = of_model(Kind.REPEATED, "many rejected pairs agree on a second configuration")
+    doubted = *before, *_doubtful_cameras(placement), *after, *((repeated,) if second else ())
+    return ModelVerdict.weigh([*doubted, *_weigh_shares(shares)])
 
 
 def _doubtful_cameras(placement: Judged) -> Iterator[Reason]:
     """Yield what speaks against each camera by its trust, its uncertainty and how loose it hangs."""
     trust, reasons = placement.assessment.trust, placement.assessment.reasons
-    found = {
-        k: (Kind.TRUST, reasons[k] or "pairs speak against it")
-        for k in np.flatnonzero(trust < LOW_TRUST).tolist()
-    }
-    uncertain = Kind.UNCERTAIN, f"it is uncertain by more than {RARE:.0%} of the extent"
-    found = dict.fromkeys(uncertain_cameras(placement).tolist(), uncertain) | found
-    adjusted = placement.adjusted_covariances
+    found = dict[int, tuple[Kind, str]]()
     for group in placement.assessment.loose_groups:  # by the pairs; where the pixels were asked, they say
+        adjusted = placement.adjusted_covariances
         if adjusted is None or np.isnan(adjusted[group.cameras]).any():
-            loose = dict.fromkeys(group.cameras.tolist(), (Kind.UNCERTAIN, str(group.cause.value)))
-            found = loose | found
+            found |= dict.fromkeys(group.cameras.tolist(), (Kind.UNCERTAIN, str(group.cause.value)))
+    uncertain = Kind.UNCERTAIN, f"it is uncertain by more than {RARE:.0%} of the extent"
+    found |= dict.fromkeys(uncertain_cameras(placement).tolist(), uncertain)
+    low = np.flatnonzero(trust < LOW_TRUST).tolist()
+    found |= {k: (Kind.TRUST, reasons[k] or "pairs speak against it") for k in low}
     for k in sorted(found, key=lambda k: (trust[k], k)):
         kind, clause = found[k]
         yield from of_each(kind, [placement.graph.name_of(int(placement.cameras[k]))], clause)
 
 
-def _reasons_to_look(placement: Judged, shares: Shares) -> Iterator[Reason]:
-    """Yield why a model is to be looked at as a whole."""
-    if placement.second_configuration is not None:
-        clause = "many rejected pairs agree on a second configuration"
-        yield Reason(kind=Kind.REPEATED, sentence=clause)
-    if shares.placed < FEW_PLACED:
-        yield Reason(kind=Kind.LEFT_OUT, sentence=f"only {shares.placed:.0%} of the images are placed")
-    elif shares.here < FEW_PLACED:
-        yield in_another_model(shares.here)
-
-
 def in_another_model(here: float) -> Reason:
     """Say that a model has only a share of the images that stand in some model."""
-    clause = f"{1.0 - here:.0%} of the images stand in another model"
-    return Reason(kind=Kind.LEFT_OUT, sentence=clause)
+    return of_model(Kind.LEFT_OUT, f"{1.0 - here:.0%} of the images stand in another model")
 
 
-def _reasons_against(shares: Shares) -> Iterator[Reason]:
-    """Yield why a model should not be used; a share that is not known is no reason."""
+def _weigh_shares(shares: Shares) -> Iterator[Reason]:
+    """Yield what too small or too large a share says against a model; one that is not known says nothing."""
     if shares.contradicting >= HALF:
         clause = f"{shares.contradicting:.0%} of the observations contradict the cameras"
-        yield Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE)
-    if shares.placed < HALF:
-        clause = f"only {shares.placed:.0%} of the images are placed"
-        yield Reason(kind=Kind.LEFT_OUT, sentence=clause, grade=Grade.DO_NOT_USE)
+        yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
+    if shares.placed < FEW_PLACED:
+        grade = Grade.DO_NOT_USE if shares.placed < HALF else Grade.LOOK
+        yield of_model(Kind.LEFT_OUT, f"only {shares.placed:.0%} of the images are placed", grade)
+    elif shares.here < FEW_PLACED:
+        yield in_another_model(shares.here)
 
 
 def uncertain_cameras(placement: Judged) -> IntArray:
