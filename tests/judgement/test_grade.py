@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit import synthetic
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import judge_graph, weigh_evidence
 from sfm_shapefit.judgement.places import OtherPlace
@@ -215,3 +216,11 @@ def test_a_camera_that_is_known_worse_than_the_scene_is_large_is_held_by_nothing
     known = placement.covariances
     assert np.isinf(known[2]).all()
     assert np.isfinite(np.delete(known, 2, axis=0)).all()
+
+
+def test_a_graph_none_of_whose_pairs_is_checked_by_others_cannot_be_judged():
+    """A triangle in the plane fits any three directions that close."""
+    edges, corners = np.array([(0, 1), (0, 2), (1, 2)]), np.array([[0.0, 0.0], [1.0, 0.1], [0.3, 0.8]])
+    ways = corners[edges[:, 0]] - corners[edges[:, 1]]
+    verdict = judge_graph(place(ViewGraph(3, edges, ways / np.linalg.norm(ways, axis=1, keepdims=True))))
+    assert verdict.statement == "cannot be judged: no pair is checked by others"
