@@ -232,7 +232,7 @@ def _adjust(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
 def _judge(stand: Stand, options: PlacingOptions, before: Images, clock: Clock) -> Judged:
     """Return the evidence for a piece where its cameras stand, without the samples of errors that it took."""
     placement, source, relative = stand.placement, stand.source, None
-    if not stand.given.believes_rotations:
+    if not (stand.given.believes_rotations or stand.has_fitting_rotations):
         relative = ask_pairs(source, stand.directions, clock.threads, stand.among)
     judged = judge(placement, source.economy.limit(options.placement))
     if stand.estimate is not None:

@@ -78,6 +78,12 @@ class Stand(NamedTuple):
         """The images whose matches are read: of a further piece, which is small, its own; None for all."""
         return self.placement.cameras if self.placement.piece else None
 
+    @property
+    def has_fitting_rotations(self) -> bool:
+        """Whether the model's own points fit its rotations as well as others: they cannot ask for turns."""
+        done = self.adjustment
+        return not self.source.has_database and done is not None and done.freedom.holds_rotations
+
     def failed(self, how: str) -> "Stand":
         """Return the same without a step that failed; `how` says which and why, a clause."""
         return self._replace(failures=(*self.failures, how))
