@@ -128,7 +128,7 @@ def adjust_placement(
         loss = AdjustmentOptions(loss_scale_px=loss_scale_px)
         errors = estimate_rotation_errors(problem, loss)
         if isinstance(links, ObservedTracks):
-            errors = without_unseen_turns(errors, problem, loss)
+            errors = without_unseen_turns(errors, problem, loss, run.share_of_frames(problem))
         decided = errors.decide(run.freedom)
     run = replace(run, freedom=decided)
     is_repeated = bool(decided.singled_out().any())

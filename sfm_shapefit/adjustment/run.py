@@ -161,6 +161,13 @@ class AdjustmentRun:
         refuse_without_points(len(found.points))
         return joined, found, self.problem(joined, found)
 
+    def share_of_frames(self, problem: AdjustmentProblem) -> FloatArray:
+        """Return the share of each frame's linked keypoints that a problem of the run has, (n,)."""
+        assert self.links is not None
+        linked = self.images.frame_of[views_of(self.images).images[self.links.cameras]]
+        seen, every = (np.bincount(of, minlength=problem.num_frames) for of in (problem.frames_seeing(), linked))
+        return np.asarray(seen / np.maximum(every, 1))
+
     def thin_problem(
         self, tracks: ObservedTracks, found: TriangulatedPoints, *, times: int = 1
     ) -> AdjustmentProblem:

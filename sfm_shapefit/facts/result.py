@@ -303,7 +303,7 @@ class LocateResult(_Placed):
             here=float(np.mean(is_posed)),
         )
         outside = [*self.placement.cameras[~self.kept].tolist(), *self.cameras_without_support]
-        repeats = tuple(match_warnings(self.directions))[:1]
+        repeats = tuple(match_warnings(self.directions, may_repeat=self.database is not None))[:1]
         names = [self.images.names[camera] for camera in outside]
         against = weigh_evidence(self.evidence, self.placed)
         suspicions = (*repeats, *self._off_priors(), *self.suspicions)

@@ -231,13 +231,16 @@ def _adjust(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
 
 def _judge(stand: Stand, options: PlacingOptions, before: Images, clock: Clock) -> Judged:
     """Return the evidence for a piece where its cameras stand, without the samples of errors that it took."""
-    placement, source, relative = stand.placement, stand.source, None
-    if not (stand.given.believes_rotations or stand.has_fitting_rotations):
+    placement, source, relative, fit = stand.placement, stand.source, None, stand.fit_rotations
+    if not (stand.given.believes_rotations or fit.all()):
         relative = ask_pairs(source, stand.directions, clock.threads, stand.among)
     judged = judge(placement, source.economy.limit(options.placement))
+    if not source.has_database:  # its points were made for one placement, and hold no second one
+        judged = replace(judged, second_configuration=None)
     if stand.estimate is not None:
         judged = with_uncertainty(judged, before, stand.estimate, stand.scale)
-    return doubt_cameras(judged.without_error_samples(), stand.directions, relative, source.images)
+    judged, sure = judged.without_error_samples(), None if source.has_database else fit[judged.cameras]
+    return doubt_cameras(judged, stand.directions, relative, source.images, sure)
 
 
 def _choose(stand: Stand, judged: Judged, min_trust: float) -> tuple[BoolArray, Stand]:
@@ -328,7 +331,7 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
     images, rule, gauge = found.placed, stand.given.rule, found.gauge
     yield from found.told_evidence.statements
     yield from intrinsics_warnings(found.intrinsics.rows(images))
-    yield from match_warnings(stand.directions)
+    yield from match_warnings(stand.directions, may_repeat=stand.source.has_database)
     yield from quality_warnings(found.placement)
     yield from trust_warnings(found.placement, found.kept)
     yield from ambiguity_warnings(found.placement)

@@ -79,10 +79,12 @@ class Stand(NamedTuple):
         return self.placement.cameras if self.placement.piece else None
 
     @property
-    def has_fitting_rotations(self) -> bool:
-        """Whether the model's own points fit its rotations as well as others: they cannot ask for turns."""
-        done = self.adjustment
-        return not self.source.has_database and done is not None and done.freedom.holds_rotations
+    def fit_rotations(self) -> BoolArray:
+        """Images (i,) whose rotations the model's own tracks fit as well as any: these ask for no turns."""
+        frames, done = np.zeros(len(self.given.images.frames.ids), dtype=np.bool_), self.adjustment
+        if not self.source.has_database and done and done.errors and done.errors.sigma_rad == 0.0:
+            frames |= ~self.freedom.singled_out()
+        return np.asarray(frames[self.given.images.frame_of])
 
     def failed(self, how: str) -> "Stand":
         """Return the same without a step that failed; `how` says which and why, a clause."""
