@@ -8,7 +8,7 @@ from sfm_shapefit.facts.model import EvidenceShares, ModelFacts, ModelInputs
 from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece, Solve
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.seed import PickedPoints
-from sfm_shapefit.judgement.grade import Grade, ModelVerdict
+from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.report.drawing import Poses, build_drawing
 
 UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7
@@ -160,6 +160,7 @@ def _facts(names):
         not_trusted={},
         few_points={},
         pairs={"usable": 102, "outlier": 18},
+        num_contradicting=0,
         agreement=EvidenceShares(pairs=0.8, observations=None, contradicting=None),
         num_points=500,
         mean_reprojection_error_px=0.62,

@@ -1,4 +1,8 @@
-"""What the user should know beyond the tables, a sentence each."""
+"""What the user should know beyond the tables, a sentence each.
+
+A warning states what is so. What that means for the use of a model the verdict alone says: a warning that
+doubts cameras has a reason in it, by the same rule, and the others stand beside any grade.
+"""
 
 from collections.abc import Iterator, Sequence
 
@@ -6,10 +10,11 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.wording import counted_are, first_of
-from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, MOST_LEVEL_DEG, largest_sigmas, uncertain_cameras
+from sfm_shapefit.judgement.grade import largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import RARE
 from sfm_shapefit.judgement.options import TrustOptions
+from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Kind, Reason
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.solver.options import Status
@@ -46,11 +51,12 @@ def rotation_warnings(turned_deg: FloatArray, names: Sequence[str], sigma_deg: f
         yield f"{counted_are(len(wrong), 'given rotation')} wrong and corrected: {first_of(wrong)}; {most}"
 
 
-def rotation_suspicions(turned_deg: FloatArray, sigma_deg: float) -> Iterator[str]:
+def rotation_suspicions(turned_deg: FloatArray, sigma_deg: float) -> Iterator[Reason]:
     """Yield that all given rotations, said to be off by `sigma_deg`, are farther off, as of another scene."""
     typical = float(np.nanmedian(turned_deg)) / _MEDIAN_TURN if np.isfinite(turned_deg).any() else 0.0
     if typical > _GROSS * sigma_deg:
-        yield f"the rotations are {typical:.0f} degrees off, not {sigma_deg:g}: {IS_ITS_DATABASE}"
+        clause = f"the rotations are {typical:.0f} degrees off, not {sigma_deg:g}: {IS_ITS_DATABASE}"
+        yield Reason(kind=Kind.INPUT, sentence=clause)
 
 
 def quality_warnings(placement: Judged) -> Iterator[str]:
@@ -58,20 +64,20 @@ def quality_warnings(placement: Judged) -> Iterator[str]:
     if placement.certified.status is not Status.CONVERGED:
         yield f"the solve is not certified to the tolerance: {placement.certified.status.value}"
     if placement.certified.unique is False:
-        yield "other placements may fit as well: the certificate does not prove the optimum unique"
+        yield "the certificate does not prove the optimum of the convex program unique"
     refined, rejected = placement.refined, len(placement.rejected_pairs) / max(len(placement.pairs), 1)
+    contradicting = placement.num_contradicting / max(len(placement.pairs), 1)
     adjusted = placement.adjusted_covariances  # pixels tell lengths, whatever the starts had
     is_measured = adjusted is not None and not np.isnan(adjusted).any()
     if refined.collapsed and not (is_measured or (refined.is_refined and rejected <= _FEW_REJECTED)):
         assert refined.disagreement is not None
         yield (
-            f"lengths are poorly known: two ways to find them disagree by {refined.disagreement:.0%}, as on "
-            "long chains and with many wrong pairs"
-            + ("" if refined.is_refined else "; objective=auto refines both and compares")
+            f"two ways to find lengths disagree by {refined.disagreement:.0%}, as on long chains and with "
+            "many wrong pairs" + ("" if refined.is_refined else "; objective=auto refines both and compares")
         )
     yield from _uncertainty_warnings(placement)
-    if rejected > _ALARMING_SHARE:
-        yield f"{rejected:.0%} of the pairs contradict the solution; do not trust it without a look"
+    if contradicting > _ALARMING_SHARE:
+        yield f"{contradicting:.0%} of the pairs contradict the solution and are set aside"
     if placement.second_configuration is not None:
         yield placement.second_configuration.statement()
 
@@ -153,9 +159,6 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
 def graph_warnings(placement: Judged) -> Iterator[str]:
     """Yield what the user should know about a bare graph, all of whose placed nodes are in the answer."""
     yield from quality_warnings(placement)
-    level = placement.assessment.level_deg
-    if level > MOST_LEVEL_DEG:
-        yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
     floor = TrustOptions().min_trust
     low = np.flatnonzero(placement.assessment.trust < floor)
     if len(low):

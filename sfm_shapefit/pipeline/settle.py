@@ -24,7 +24,7 @@ from sfm_shapefit.base.geometry import fit_similarity, fit_similarity_l1, median
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
 from sfm_shapefit.facts.options import PlacingOptions
-from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.facts.result import NO_POINTS, LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
 from sfm_shapefit.facts.warnings import (
     ambiguity_warnings,
@@ -42,6 +42,7 @@ from sfm_shapefit.judgement.doubted import confirm_cameras
 from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.judgement.limits import RARE
+from sfm_shapefit.judgement.reasons import Kind, Reason
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_cameras, turned_deg, with_uncertainty
@@ -201,7 +202,7 @@ def finish_piece(
         intrinsics=intrinsics,
         rigs=rigs,
         control_points=control,
-        suspicions=stand.failures,
+        suspicions=tuple(Reason(kind=Kind.FAILED, sentence=one) for one in stand.failures),
     )
     return replace(found, warnings=(*_warnings(found, stand), *told))
 
@@ -344,7 +345,7 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
         limit = f"max_memory_mb={found.options.memory.max_memory_mb}"
         yield f"to stay below {limit}, {stand.source.economy.statement}"
     if found.model.num_points3D() == 0:
-        yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
+        yield f"{NO_POINTS}; bundle adjustment has nothing to start from"
     if names := stand.source.matches.missing_names:
         yield f"the database lacks {counted(len(names), 'image')} of the model: {first_of(names)}"
     yield from prior_warnings(found.prior_fit, images.names)

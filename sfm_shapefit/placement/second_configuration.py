@@ -49,7 +49,7 @@ class SecondConfiguration:
         return (
             f"{self.num_pairs} rejected pairs agree with one another on another placement of "
             f"{len(self.cameras)} cameras, against {self.num_against} pairs that agree with this one: "
-            "repeated structure, or two scenes in one; do not trust it without a look"
+            "repeated structure, or two scenes in one"
         )
 
 

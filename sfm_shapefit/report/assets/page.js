@@ -7,7 +7,7 @@ const drawHead = () => {
   $("banner").dataset.grade = banner.grade;
   $("h-cameras").textContent = `${capital(data.noun)}s`;
   $("h-matrix").textContent = `Which ${data.noun}s are paired`;
-  $("mark").textContent = { good: "✓", look: "!", "do not use": "✕" }[banner.grade] ?? "";
+  $("mark").textContent = { good: "✓", look: "!", "cannot be judged": "?", "do not use": "✕" }[banner.grade] ?? "";
   $("verdict").textContent = banner.headline;
   $("why").textContent = banner.sentence;
   if (banner.command) {
@@ -58,8 +58,10 @@ const drawFacts = () => {
   }));
   fill("summary", ...data.summary.map((text) => element("li", text)));
   fill("expert-facts", ...data.expertFacts.map((text) => element("li", text)));
+  const isGood = data.banner.grade === "good";
+  if (isGood) $("looks-title").textContent = "Of note";
   const looks = data.looks.map(({ text, camera, pair }) => {
-    const item = element("li");
+    const item = element("li", "", isGood ? "fine" : "");
     const target = camera ?? pair;
     if (target === null) item.append(element("span", text));
     else item.append(button(text, "link", () => select(camera === null ? "pair" : "camera", target)));
