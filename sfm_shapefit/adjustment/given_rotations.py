@@ -32,10 +32,10 @@ random turns of the freed frames do. With C the costs of held, freed and turned 
     sigma_seen^2 = sigma^2 (C_held - C_free) / (C_turned - C_free)
 
 is what the pixels show. Where it is less than half of sigma^2, the turns are of the kind that pixels do not
-see, and rotations are held. Frames are freed all the same if the cost of their observations, over the share
-of them that fits at all, is three times as large held as freed; twice, if their own halves call them wrong.
-An indoor drone that yaws on the spot has right frames of up to 2.4 by that, and frames turned by 3 to 20
-degrees from 4.3 on.
+see, and rotations are held; `open_shape` says what that leaves open. Frames are freed all the same if the
+cost of their observations, over the share of them that fits at all, is three times as large held as freed;
+twice, if their own halves call them wrong. An indoor drone that yaws on the spot has right frames of up to
+2.4 by that, and frames turned by 3 to 20 degrees from 4.3 on.
 """
 
 from dataclasses import dataclass, replace
@@ -167,7 +167,9 @@ def without_unseen_turns(
     bare, options = replace(problem, rotation_prior=None), replace(options, cost_tolerance=_FALL)
     assert options.loss_scale_px is not None
     free = adjust(bare, options, hold_rotations=False).problem
-    turns = (errors.sigma_rad * ~problem.fixed[:, None]) * np.random.default_rng(0).standard_normal((problem.num_frames, 3))
+    turns = (errors.sigma_rad * ~problem.fixed[:, None]) * np.random.default_rng(0).standard_normal(
+        (problem.num_frames, 3)
+    )
     turned = replace(free, rotations=rotations_of(turns) @ free.rotations)
     freed, held, worse = (
         costs_of_frames(end, options.loss_scale_px)
@@ -179,7 +181,7 @@ def without_unseen_turns(
         return errors
     least = np.where(errors.are_wrong, _BETTER, _CLEARLY_BETTER)
     are_wrong = ~problem.fixed & (held > least * fitting * freed)
-    sigmas = np.where(are_wrong, np.inf, np.sqrt(seen) * errors.frame_sigmas_rad)
+    sigmas = np.where(are_wrong, np.inf, 0.0)
     return replace(errors, sigma_rad=0.0, frame_sigmas_rad=sigmas, are_wrong=are_wrong)
 
 

@@ -25,19 +25,20 @@ from sfm_shapefit.adjustment.run import MOST_FRAMES, AdjustmentRun, begin
 from sfm_shapefit.adjustment.solve import reprojection_errors_px
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import distances_in_spreads, fit_similarity_l1
+from sfm_shapefit.base.geometry import INSIDE, distances_in_spreads, fit_similarity_l1
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import PARTS, Origin
 from sfm_shapefit.tracks.links import ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
 
 _FALL = 1e-5  # relative fall of the cost at which the drift ends; valleys are long and flat
-_INSIDE = 30.0  # spreads; cameras within say how the drifted model lies to the given one
 _MEDIAN_LENGTH = 1.1774  # median length of a normal error in the plane, in standard deviations per axis
 _LEAST_REDUNDANCY = 0.1  # least share of the errors that unknowns are taken to leave
 
 
-def estimate_open_shape(images: Images, tracks: ObservedTracks, *, rotations_held: bool) -> FloatArray | None:
+def estimate_open_shape(
+    images: Images, tracks: ObservedTracks, *, lenses_held: bool = False, rotations_held: bool = False
+) -> FloatArray | None:
     """Return what a model's own tracks leave open of its centers, covariances (i, 3, 3), in squared units.
 
     None where it is not known: too many frames, or points that leave more open than a similarity.
@@ -45,10 +46,10 @@ def estimate_open_shape(images: Images, tracks: ObservedTracks, *, rotations_hel
     Args:
         images: all posed, where the model has them.
         tracks: of its points.
-        rotations_held: whether rotations are known from elsewhere.
+        lenses_held, rotations_held: whether these are known from elsewhere.
     """
     doubted = [lens.in_doubt(Origin.GUESS) if lens.is_adjustable else lens for lens in images.lenses]
-    parts = np.tile([[lens.is_adjustable] for lens in images.lenses], (1, len(PARTS)))
+    parts = np.array([[lens.is_adjustable and not lenses_held] * len(PARTS) for lens in images.lenses])
     freedom = Freedom(parts=parts, pull_rad=0.0 if rotations_held else np.inf)
     images = images.with_lenses(doubted)
     if len(images.frames.ids) > MOST_FRAMES:
@@ -65,7 +66,7 @@ def estimate_open_shape(images: Images, tracks: ObservedTracks, *, rotations_hel
 
 
 def _excess(run: AdjustmentRun, problem: AdjustmentProblem) -> FloatArray:
-    """Return what lenses that are free add to the covariances of frames (f, 3, 3), where the problem stands."""
+    """Return what free lenses add to the covariances of frames (f, 3, 3), where the problem stands."""
     options = run.options_at_optimum()
     free = run.freedom.apply(problem, None)
     known = estimate_covariances(free, options, **run.freedom.overrides())
@@ -75,7 +76,7 @@ def _excess(run: AdjustmentRun, problem: AdjustmentProblem) -> FloatArray:
 def _drift(before: Images, after: Images) -> FloatArray:
     """Return |d|^2 / 3 along the axes (f, 3, 3) for how far frames have moved, but for a similarity."""
     own, moved = before.frames.centers, after.frames.centers
-    inside = distances_in_spreads(own, own) <= _INSIDE
+    inside = distances_in_spreads(own, own) <= INSIDE
     apart = fit_similarity_l1(moved[inside], own[inside]).apply(moved) - own
     return np.asarray(np.sum(apart**2, axis=1)[:, None, None] / 3.0 * np.eye(3))
 

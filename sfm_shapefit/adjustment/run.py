@@ -165,7 +165,9 @@ class AdjustmentRun:
         """Return the share of each frame's linked keypoints that a problem of the run has, (n,)."""
         assert self.links is not None
         linked = self.images.frame_of[views_of(self.images).images[self.links.cameras]]
-        seen, every = (np.bincount(of, minlength=problem.num_frames) for of in (problem.frames_seeing(), linked))
+        seen, every = (
+            np.bincount(of, minlength=problem.num_frames) for of in (problem.frames_seeing(), linked)
+        )
         return np.asarray(seen / np.maximum(every, 1))
 
     def thin_problem(

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
+from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, extent_of, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
-from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, OUTNUMBERED, SIGMAS, SURE_SIGMAS
+from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, OUTNUMBERED, RARE, SIGMAS, SURE_SIGMAS
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam
@@ -165,6 +165,30 @@ class SecondOpinion(NamedTuple):
         return self.usual > FEW and not (len(self.wrong) or len(self.undecided) or len(self.ambiguous))
 
 
+class OpenShape(NamedTuple):
+    """What the points leave open of a model's shape, see `adjustment.open_shape`."""
+
+    covariances: FloatArray
+    """(n, 3, 3) of the centers, squared units of the images; 0 for cameras without a pose."""
+    cameras: IntArray
+    """Rows of those whose largest standard deviation is above 5 % of the extent."""
+    largest: float
+    """The largest of all, as a share of the extent."""
+
+    @classmethod
+    def of(cls, images: Images, rows: IntArray, covariances: FloatArray) -> "OpenShape":
+        """Return what covariances (r, 3, 3) of the posed images, by their rows (r,), leave open."""
+        of_all = np.zeros((images.num_images, 3, 3))
+        of_all[rows] = covariances
+        sigmas = np.sqrt(np.einsum("naa->na", of_all)).max(axis=1) / extent_of(images.centers[rows])
+        return cls(of_all, np.flatnonzero(sigmas > RARE), float(sigmas.max()))
+
+
+def how_far(share: float) -> str:
+    """Say a share of the extent."""
+    return f"by {share:.0%} of the extent" if share <= 1.0 else "by more than the extent"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModelEvidence:
     """What speaks against a model although it fits."""
@@ -183,6 +207,8 @@ class ModelEvidence:
     """Cameras of the largest group that agreeing pairs, or points that fit, hold; None without pairs."""
     second: SecondOpinion | None = None
     """How another model of the same matches compares; None if there is none."""
+    shape: OpenShape | None = None
+    """What the points leave open, where nothing else measured lenses; None where that is not asked."""
 
     def beside(self, second: SecondOpinion, contradicting: IntArray) -> "ModelEvidence":
         """Return the same with a second opinion, without what that clears; `contradicting` is (b, 2) pairs.
