@@ -7,6 +7,10 @@ shows less than that the images ask for unlike ones: it is wrong if half of them
 three deviations. With right lenses, no image of 17 scenes changed by ten deviations, and half of those of a
 lens changed by 0.2 % at most, or by two deviations; with all lenses wrong by 0.8 to 1.3 and the points
 adjusted to that, half of them changed by 0.5 % or more.
+
+Poses that are rough, as of a network, put their errors on one lens. So a focal length is not believed that
+leaves the range of like lenses, by more than 2.5 % and three deviations; like ones have the same model and
+size, and took one image each.
 """
 
 from typing import NamedTuple
@@ -38,6 +42,23 @@ class WrongLens(NamedTuple):
     """Images that were asked."""
     score: float
     """Change in standard deviations, the median one of its images."""
+
+
+def is_like_others(images: Images, lens: int, focal_px: float, sigma: float) -> bool:
+    """Return whether a focal length, known to a share `sigma`, is in the range of like lenses, or has few."""
+    single = np.bincount(images.lens_of, minlength=len(images.lenses)) == 1
+    own = images.lenses[lens]
+    like = [
+        one.focal_px
+        for k, one in enumerate(images.lenses)
+        if single[k]
+        and k != lens
+        and (one.model, one.width, one.height) == (own.model, own.width, own.height)
+    ]
+    if not single[lens] or len(like) < SMALLEST_SHAPE:
+        return True
+    margin = (1.0 + _ONE[0]) * (1.0 + SIGMAS * sigma)
+    return min(like) / margin <= focal_px <= max(like) * margin
 
 
 def question_lenses(
@@ -89,7 +110,8 @@ def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
         sigma = float(left_out.sigmas[rows].max())
         if len(rows) >= SMALLEST_SHAPE:
             sigma = SIGMA_PER_MEDIAN * float(np.median(np.abs(changes - middle)))
-        score = float(np.median(scores[rows]))
-        if np.median(np.abs(changes)) > least and score > deviations:
-            found.append(WrongLens(lens, float(np.exp(middle)), sigma, len(rows), score))
+        score, factor = float(np.median(scores[rows])), float(np.exp(middle))
+        believed = is_like_others(images, lens, factor * images.lenses[lens].focal_px, sigma)
+        if believed and np.median(np.abs(changes)) > least and score > deviations:
+            found.append(WrongLens(lens, factor, sigma, len(rows), score))
     return tuple(sorted(found, key=lambda item: -item.score))
