@@ -14,6 +14,7 @@ sound models of 7 to 100 images, 97 % of the cameras drift by less than 2 % of t
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.lens_doubts import excess
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.run import MOST_FRAMES, AdjustmentRun, begin
+from sfm_shapefit.adjustment.run import MOST_FRAMES, begin
 from sfm_shapefit.adjustment.solve import reprojection_errors_px
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
@@ -36,10 +37,19 @@ _MEDIAN_LENGTH = 1.1774  # median length of a normal error in the plane, in stan
 _LEAST_REDUNDANCY = 0.1  # least share of the errors that unknowns are taken to leave
 
 
+class LeftOpen(NamedTuple):
+    """What is left open of centers, covariances (i, 3, 3) in squared units of the images."""
+
+    more: FloatArray
+    """Beside what noise does where lenses are known."""
+    all: FloatArray
+    """With what noise does."""
+
+
 def estimate_open_shape(
     images: Images, tracks: ObservedTracks, *, lenses_held: bool = False, rotations_held: bool = False
-) -> FloatArray | None:
-    """Return what a model's own tracks leave open of its centers, covariances (i, 3, 3), in squared units.
+) -> LeftOpen | None:
+    """Return what a model's own tracks leave open of its centers.
 
     None where it is not known: too many frames, or points that leave more open than a similarity.
 
@@ -59,18 +69,15 @@ def estimate_open_shape(
         _, _, problem = run.problem_of_all(checked=True)
         run = replace(run, freedom=replace(run.freedom, noise_px=_noise_px(problem)))
         after, _ = run.solve(problem, _FALL)
-        left_open = _excess(after, problem) + _drift(images, after.images)
+        options = after.options_at_optimum()
+        free = estimate_covariances(freedom.apply(problem, None), options, **freedom.overrides())
+        held = estimate_covariances(problem, options, deciding=free.deciding)
+        drift = _drift(images, after.images)
     except UnsolvableError:
         return None
-    return left_open[images.frame_of]
-
-
-def _excess(run: AdjustmentRun, problem: AdjustmentProblem) -> FloatArray:
-    """Return what free lenses add to the covariances of frames (f, 3, 3), where the problem stands."""
-    options = run.options_at_optimum()
-    free = run.freedom.apply(problem, None)
-    known = estimate_covariances(free, options, **run.freedom.overrides())
-    return excess(known.centers, estimate_covariances(problem, options, deciding=known.deciding).centers)
+    more = excess(free.centers, held.centers) + drift
+    every = np.nan_to_num(free.centers) + drift
+    return LeftOpen(more[images.frame_of], every[images.frame_of])
 
 
 def _drift(before: Images, after: Images) -> FloatArray:

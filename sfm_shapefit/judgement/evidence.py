@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.open_shape import LeftOpen
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, extent_of, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
@@ -21,6 +22,7 @@ from sfm_shapefit.judgement.places import OtherPlace, find_other_places
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
+from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.scene.images import Images
@@ -169,19 +171,19 @@ class OpenShape(NamedTuple):
     """What the points leave open of a model's shape, see `adjustment.open_shape`."""
 
     covariances: FloatArray
-    """(n, 3, 3) of the centers, squared units of the images; 0 for cameras without a pose."""
+    """(n, 3, 3) of the centers, squared units of the images, beside what noise does; 0 without a pose."""
     cameras: IntArray
-    """Rows of those whose largest standard deviation is above 5 % of the extent."""
+    """Rows of those whose largest standard deviation, by noise too, is above 5 % of the extent."""
     largest: float
     """The largest of all, as a share of the extent."""
 
     @classmethod
-    def of(cls, images: Images, rows: IntArray, covariances: FloatArray) -> "OpenShape":
-        """Return what covariances (r, 3, 3) of the posed images, by their rows (r,), leave open."""
-        of_all = np.zeros((images.num_images, 3, 3))
-        of_all[rows] = covariances
-        sigmas = np.sqrt(np.einsum("naa->na", of_all)).max(axis=1) / extent_of(images.centers[rows])
-        return cls(of_all, np.flatnonzero(sigmas > RARE), float(sigmas.max()))
+    def of(cls, images: Images, rows: IntArray, found: LeftOpen) -> "OpenShape":
+        """Return what is left open of the posed images, by their rows (r,)."""
+        more = np.zeros((images.num_images, 3, 3))
+        more[rows] = found.more
+        sigmas = standard_deviations(found.all).max(axis=1) / extent_of(images.centers[rows])
+        return cls(more, np.sort(rows[sigmas > RARE]), float(sigmas.max()))
 
 
 def how_far(share: float) -> str:
