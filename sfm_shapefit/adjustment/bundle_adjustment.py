@@ -120,7 +120,7 @@ def adjust_placement(
         solve, again = steps.solve_twice_thinly, steps.solve_thinly_again
         run, _ = steps.repeat_with_known_lenses(run, solve, again)
         run = run.moved(run.images.posed(images.frames.rotations, run.images.frames.centers))
-    _, _, problem = run.problem_of_all(checked=True)
+    tracks, found, problem = run.problem_of_all(checked=True)
     decided = replace(run.freedom, pull_rad=freedom.pull_rad)
     if freedom.pull_rad is None:
         # The loss of the adjustment itself: a wider one lets wrong matches hide what the right ones say.
@@ -128,7 +128,7 @@ def adjust_placement(
         loss = AdjustmentOptions(loss_scale_px=loss_scale_px)
         errors = estimate_rotation_errors(problem, loss)
         if isinstance(links, ObservedTracks):
-            errors = without_unseen_turns(errors, problem, loss, run.share_of_frames(problem))
+            errors = without_unseen_turns(errors, problem, loss, run.share_of_frames(tracks, found))
         decided = errors.decide(run.freedom)
     run = replace(run, freedom=decided)
     is_repeated = bool(decided.singled_out().any())

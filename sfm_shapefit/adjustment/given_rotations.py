@@ -159,7 +159,7 @@ def without_unseen_turns(
     Args:
         errors: of `estimate_rotation_errors`.
         problem, options: as there.
-        fitting: (n,) share of each frame's observations that the problem has, as the others do not fit.
+        fitting: (n,) share of each frame's observations of the points that fit these.
     """
     are_doubted = errors.sigma_rad > 0.0 or errors.are_wrong.any() or np.any(fitting < _SEEN)
     if not (are_doubted and errors.chance_rad > 0.0):

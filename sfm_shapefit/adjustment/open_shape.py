@@ -3,7 +3,7 @@
 Lenses of a model that nobody calibrated were found with its shape, and so were its rotations, if its own
 tracks are all there is. Few views, forward motion, or a yaw on the spot leave focal length, distortion and
 shape free together: a model that fits its points is one of many. What the points leave open of each center
-is the sum of two parts, with lenses pulled by what a guess may be off (`Lens.in_doubt`):
+is the sum of two parts, with lenses pulled by what unmeasured ones may be off, a factor of two:
 
     covariance    by noise, what it grows by when the lenses are free, at the points where the model stands
     drift         |d|^2 / 3 along every axis, d the way to the minimum with all free: one draw of three axes
@@ -28,11 +28,12 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import INSIDE, distances_in_spreads, fit_similarity_l1
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import PARTS, Origin
+from sfm_shapefit.scene.lens import PARTS, Lens, Origin
 from sfm_shapefit.tracks.links import ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
 
 _FALL = 1e-5  # relative fall of the cost at which the drift ends; valleys are long and flat
+_FOCAL_SIGMA = float(np.log(2.0))  # share; a focal length that only a bent shape holds may be twice too long
 _MEDIAN_LENGTH = 1.1774  # median length of a normal error in the plane, in standard deviations per axis
 _LEAST_REDUNDANCY = 0.1  # least share of the errors that unknowns are taken to leave
 
@@ -58,7 +59,7 @@ def estimate_open_shape(
         tracks: of its points.
         lenses_held, rotations_held: whether these are known from elsewhere.
     """
-    doubted = [lens.in_doubt(Origin.GUESS) if lens.is_adjustable else lens for lens in images.lenses]
+    doubted = [_unmeasured(lens) if lens.is_adjustable else lens for lens in images.lenses]
     parts = np.array([[lens.is_adjustable and not lenses_held] * len(PARTS) for lens in images.lenses])
     freedom = Freedom(parts=parts, pull_rad=0.0 if rotations_held else np.inf)
     images = images.with_lenses(doubted)
@@ -78,6 +79,12 @@ def estimate_open_shape(
     more = excess(free.centers, held.centers) + drift
     every = np.nan_to_num(free.centers) + drift
     return LeftOpen(more[images.frame_of], every[images.frame_of])
+
+
+def _unmeasured(lens: Lens) -> Lens:
+    """Return a lens that may be off by what nothing measured is off by."""
+    doubted = lens.in_doubt(Origin.GUESS)
+    return replace(doubted, sigmas=(_FOCAL_SIGMA, *doubted.sigmas[1:]))
 
 
 def _drift(before: Images, after: Images) -> FloatArray:

@@ -161,14 +161,13 @@ class AdjustmentRun:
         refuse_without_points(len(found.points))
         return joined, found, self.problem(joined, found)
 
-    def share_of_frames(self, problem: AdjustmentProblem) -> FloatArray:
-        """Return the share of each frame's linked keypoints that a problem of the run has, (n,)."""
-        assert self.links is not None
-        linked = self.images.frame_of[views_of(self.images).images[self.links.cameras]]
-        seen, every = (
-            np.bincount(of, minlength=problem.num_frames) for of in (problem.frames_seeing(), linked)
-        )
-        return np.asarray(seen / np.maximum(every, 1))
+    def share_of_frames(self, tracks: ObservedTracks, found: TriangulatedPoints) -> FloatArray:
+        """Return the share of each frame's observations of triangulated tracks that fit the points, (n,)."""
+        frames = self.images.frame_of[views_of(self.images).images[tracks.cameras]]
+        track_of = np.repeat(np.arange(len(tracks.offsets) - 1), tracks.lengths())
+        in_points, count = np.isin(track_of, found.tracks), len(self.images.frames.ids)
+        fit, every = (np.bincount(frames[x], minlength=count) for x in (found.points_seen >= 0, in_points))
+        return np.where(every > 0, fit / np.maximum(every, 1), 1.0)
 
     def thin_problem(
         self, tracks: ObservedTracks, found: TriangulatedPoints, *, times: int = 1
