@@ -120,8 +120,7 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
         draws += [_draw_halves(bare, free, seed) for seed in range(1, _DRAWS)]
     known = np.all([draw.known for draw in draws], axis=0)
     unknowns = 3 * problem.num_points + 2 * 6 * problem.num_frames
-    redundancy = max(1.0 - unknowns / max(2 * problem.num_observations, 1), _LEAST_REDUNDANCY)
-    noise_px = draws[0].median_error_px / _MEDIAN_LENGTH / np.sqrt(redundancy)
+    noise_px = noise_of(draws[0].median_error_px, unknowns, problem.num_observations)
     if np.sum(known) < _FEWEST_FRAMES:
         return RotationErrors(
             sigma_rad=0.0,
@@ -149,6 +148,12 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
         noise_px=noise_px,
         num_frames=len(agreement),
     )
+
+
+def noise_of(median_error_px: float, unknowns: int, num_observations: int) -> float:
+    """Return the standard deviation of an observation per axis, px, from the median error after a fit."""
+    redundancy = max(1.0 - unknowns / max(2 * num_observations, 1), _LEAST_REDUNDANCY)
+    return float(median_error_px / _MEDIAN_LENGTH / np.sqrt(redundancy))
 
 
 def without_unseen_turns(

@@ -20,6 +20,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
+from sfm_shapefit.adjustment.given_rotations import noise_of
 from sfm_shapefit.adjustment.lens_doubts import excess
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.run import MOST_FRAMES, begin
@@ -34,8 +35,6 @@ from sfm_shapefit.tracks.options import StructureOptions
 
 _FALL = 1e-5  # relative fall of the cost at which the drift ends; valleys are long and flat
 _FOCAL_SIGMA = float(np.log(2.0))  # share; a focal length that only a bent shape holds may be twice too long
-_MEDIAN_LENGTH = 1.1774  # median length of a normal error in the plane, in standard deviations per axis
-_LEAST_REDUNDANCY = 0.1  # least share of the errors that unknowns are taken to leave
 
 
 class LeftOpen(NamedTuple):
@@ -43,7 +42,7 @@ class LeftOpen(NamedTuple):
 
     more: FloatArray
     """Beside what noise does where lenses are known."""
-    all: FloatArray
+    every: FloatArray
     """With what noise does."""
 
 
@@ -98,5 +97,4 @@ def _drift(before: Images, after: Images) -> FloatArray:
 def _noise_px(problem: AdjustmentProblem) -> float:
     """Return the standard deviation of an observation per axis, by the median error."""
     unknowns = 3 * problem.num_points + 6 * problem.num_frames
-    redundancy = max(1.0 - unknowns / (2 * problem.num_observations), _LEAST_REDUNDANCY)
-    return float(np.nanmedian(reprojection_errors_px(problem)) / _MEDIAN_LENGTH / np.sqrt(redundancy))
+    return noise_of(float(np.nanmedian(reprojection_errors_px(problem))), unknowns, problem.num_observations)

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.open_shape import LeftOpen
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, extent_of, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
@@ -171,19 +170,19 @@ class OpenShape(NamedTuple):
     """What the points leave open of a model's shape, see `adjustment.open_shape`."""
 
     covariances: FloatArray
-    """(n, 3, 3) of the centers, squared units of the images, beside what noise does; 0 without a pose."""
+    """Covariances (n, 3, 3) of the centers, beside what noise does, in squared units; 0 without a pose."""
     cameras: IntArray
     """Rows of those whose largest standard deviation, by noise too, is above 5 % of the extent."""
     largest: float
     """The largest of all, as a share of the extent."""
 
     @classmethod
-    def of(cls, images: Images, rows: IntArray, found: LeftOpen) -> "OpenShape":
-        """Return what is left open of the posed images, by their rows (r,)."""
-        more = np.zeros((images.num_images, 3, 3))
-        more[rows] = found.more
-        sigmas = standard_deviations(found.all).max(axis=1) / extent_of(images.centers[rows])
-        return cls(more, np.sort(rows[sigmas > RARE]), float(sigmas.max()))
+    def of(cls, images: Images, rows: IntArray, more: FloatArray, every: FloatArray) -> "OpenShape":
+        """Return what is left open of the posed images, by their rows (r,); `every` is with noise."""
+        covariances = np.zeros((images.num_images, 3, 3))
+        covariances[rows] = more
+        sigmas = standard_deviations(every).max(axis=1) / extent_of(images.centers[rows])
+        return cls(covariances, np.sort(rows[sigmas > RARE]), float(sigmas.max()))
 
 
 def how_far(share: float) -> str:

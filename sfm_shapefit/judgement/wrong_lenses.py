@@ -8,16 +8,16 @@ three deviations. With right lenses, no image of 17 scenes changed by ten deviat
 lens changed by 0.2 % at most, or by two deviations; with all lenses wrong by 0.8 to 1.3 and the points
 adjusted to that, half of them changed by 0.5 % or more.
 
-Poses that are rough, as of a network, put their errors on one lens. So a focal length is not believed that
-leaves the range of like lenses, by more than 2.5 % and three deviations; like ones have the same model and
-size, and took one image each.
+Poses that are rough, as of a network, put their errors on one lens. So it takes ten deviations all the same
+to ask for a focal length that leaves the range of like lenses, by more than 2.5 % and three deviations; like
+ones have the same model and size, and took one image each.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
 from sfm_shapefit.judgement.limits import HALF, OUTNUMBERED, SIGMAS, SMALLEST_SHAPE
@@ -61,6 +61,14 @@ def is_like_others(images: Images, lens: int, focal_px: float, sigma: float) -> 
     return min(like) / margin <= focal_px <= max(like) * margin
 
 
+def _ask_for_like(left_out: LeftOut, images: Images, lens: int, rows: IntArray) -> bool:
+    """Return whether images of a lens ask for a focal length in the range of like ones."""
+    if not len(rows):
+        return True
+    factor, sigma = np.exp(np.median(left_out.log_factors[rows])), left_out.sigmas[rows].max()
+    return is_like_others(images, lens, float(factor * images.lenses[lens].focal_px), float(sigma))
+
+
 def question_lenses(
     points: Points,
     images: Images,
@@ -101,8 +109,9 @@ def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
         if len(rows) >= SMALLEST_SHAPE:
             least, deviations = _HALF
         elif own.sum() < SMALLEST_SHAPE and len(others) >= SMALLEST_SHAPE:
-            deviations = min(deviations, clear)
-            rows = np.flatnonzero(own & (left_out.observable | (scores > clear)))
+            some = np.flatnonzero(own & (left_out.observable | (scores > clear)))
+            if _ask_for_like(left_out, images, lens, some):
+                deviations, rows = min(deviations, clear), some
         if not len(rows):
             continue
         changes = left_out.log_factors[rows]
@@ -110,8 +119,7 @@ def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
         sigma = float(left_out.sigmas[rows].max())
         if len(rows) >= SMALLEST_SHAPE:
             sigma = SIGMA_PER_MEDIAN * float(np.median(np.abs(changes - middle)))
-        score, factor = float(np.median(scores[rows])), float(np.exp(middle))
-        believed = is_like_others(images, lens, factor * images.lenses[lens].focal_px, sigma)
-        if believed and np.median(np.abs(changes)) > least and score > deviations:
-            found.append(WrongLens(lens, factor, sigma, len(rows), score))
+        score = float(np.median(scores[rows]))
+        if np.median(np.abs(changes)) > least and score > deviations:
+            found.append(WrongLens(lens, float(np.exp(middle)), sigma, len(rows), score))
     return tuple(sorted(found, key=lambda item: -item.score))

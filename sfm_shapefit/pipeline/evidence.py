@@ -85,7 +85,7 @@ def ask_shape(
         return None
     held = {"lenses_held": lenses_held, "rotations_held": rotations_held}
     found = None if all(held.values()) else estimate_open_shape(images.part(rows), tracks, **held)
-    return None if found is None else OpenShape.of(images, rows, found)
+    return None if found is None else OpenShape.of(images, rows, *found)
 
 
 def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:
