@@ -9,12 +9,13 @@ import numpy as np
 from sfm_shapefit.adjustment import run as steps
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
-from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors
+from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors, without_unseen_turns
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.tracks.links import ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
 
 _MANY_FRAMES = 1_000  # frames whose poses, if they are fine, need no coarse solve; it is half of the time
@@ -119,12 +120,15 @@ def adjust_placement(
         solve, again = steps.solve_twice_thinly, steps.solve_thinly_again
         run, _ = steps.repeat_with_known_lenses(run, solve, again)
         run = run.moved(run.images.posed(images.frames.rotations, run.images.frames.centers))
-    _, _, problem = run.problem_of_all(checked=True)
+    tracks, found, problem = run.problem_of_all(checked=True)
     decided = replace(run.freedom, pull_rad=freedom.pull_rad)
     if freedom.pull_rad is None:
         # The loss of the adjustment itself: a wider one lets wrong matches hide what the right ones say.
         loss_scale_px = run.choose_scale(problem) * options.max_reprojection_error_px
-        errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
+        loss = AdjustmentOptions(loss_scale_px=loss_scale_px)
+        errors = estimate_rotation_errors(problem, loss)
+        if isinstance(links, ObservedTracks):
+            errors = without_unseen_turns(errors, problem, loss, run.share_of_frames(tracks, found))
         decided = errors.decide(run.freedom)
     run = replace(run, freedom=decided)
     is_repeated = bool(decided.singled_out().any())

@@ -207,7 +207,8 @@ def _ground(system: ReducedSystem, motions: FloatArray, nodes: IntArray) -> None
     """Double a diagonal entry of the given nodes for each motion, chosen to distinguish the motions."""
     count = motions.shape[2]
     seen_there = motions[nodes].reshape(-1, count)
-    _, order, *_ = dgeqp3((seen_there / np.abs(motions).max(axis=(0, 1))).T)  # it counts from 1
+    largest = np.abs(motions).max(axis=(0, 1))
+    _, order, *_ = dgeqp3((seen_there / np.where(largest > 0.0, largest, 1.0)).T)  # it counts from 1
     rows, slots = np.divmod(order[:count] - 1, SLOTS)
     system.diagonal[nodes[rows], slots, slots] *= 2.0
 

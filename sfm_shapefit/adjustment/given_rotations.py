@@ -23,6 +23,19 @@ of them is wrong, and must not be held: then the others, instead of being held, 
 
 What calibration errors do to the frames is the same in both halves and cannot be told from errors of the
 rotations. Who measured rotations better than the matches know them has to say so.
+
+Points of the model itself were fitted with its rotations. Where a camera yaws on the spot, or baselines are
+short, lens errors turn whole groups of freed frames by degrees and gain next to nothing. So for such points
+the gain counts (`without_unseen_turns`): errors of sigma about every axis would raise the cost by as much as
+random turns of the freed frames do. With C the costs of held, freed and turned frames,
+
+    sigma_seen^2 = sigma^2 (C_held - C_free) / (C_turned - C_free)
+
+is what the pixels show. Where it is less than half of sigma^2, the turns are of the kind that pixels do not
+see, and rotations are held; `open_shape` says what that leaves open. Frames are freed all the same if the
+cost of their observations, over the share of them that fits at all, is three times as large held as freed;
+twice, if their own halves call them wrong. An indoor drone that yaws on the spot has right frames of up to
+2.4 by that, and frames turned by 3 to 20 degrees from 4.3 on.
 """
 
 from dataclasses import dataclass, replace
@@ -33,10 +46,10 @@ import numpy as np
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
+from sfm_shapefit.adjustment.solve import adjust, costs_of_frames, reprojection_errors_px
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
-from sfm_shapefit.base.quaternions import rotation_vectors
+from sfm_shapefit.base.quaternions import rotation_vectors, rotations_of
 
 _FEWEST_POINTS = 10  # points of a frame in each half; fewer do not determine its turn
 _FEWEST_FRAMES = 3  # frames with enough points; the medians of fewer say nothing
@@ -54,6 +67,8 @@ _UNSURE, _DRAWS = (0.5, 3.0), 3
 _NEARLY_HELD = 0.1  # share of the chance by which others pull where some are wrong; they would be held
 _CLEAR = 3.0 * 2.0 / np.sqrt(3.0)  # agreement over chance; three standard deviations beyond 0
 _CERTAIN = 10.0 * 2.0 / np.sqrt(3.0)  # agreement over chance; ten of them, as such products have long tails
+_SEEN = 0.5  # share of squared errors that the pixels show, and of observations that fit; see the header
+_BETTER, _CLEARLY_BETTER = 2.0, 3.0  # costs of a frame, held over freed, that show it wrong; see the header
 _RARE = 4.6  # mean square of a normal error in space, in variances per axis; exceeded once in 300 times
 
 
@@ -105,8 +120,7 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
         draws += [_draw_halves(bare, free, seed) for seed in range(1, _DRAWS)]
     known = np.all([draw.known for draw in draws], axis=0)
     unknowns = 3 * problem.num_points + 2 * 6 * problem.num_frames
-    redundancy = max(1.0 - unknowns / max(2 * problem.num_observations, 1), _LEAST_REDUNDANCY)
-    noise_px = draws[0].median_error_px / _MEDIAN_LENGTH / np.sqrt(redundancy)
+    noise_px = noise_of(draws[0].median_error_px, unknowns, problem.num_observations)
     if np.sum(known) < _FEWEST_FRAMES:
         return RotationErrors(
             sigma_rad=0.0,
@@ -134,6 +148,46 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
         noise_px=noise_px,
         num_frames=len(agreement),
     )
+
+
+def noise_of(median_error_px: float, unknowns: int, num_observations: int) -> float:
+    """Return the standard deviation of an observation per axis, px, from the median error after a fit."""
+    redundancy = max(1.0 - unknowns / max(2 * num_observations, 1), _LEAST_REDUNDANCY)
+    return float(median_error_px / _MEDIAN_LENGTH / np.sqrt(redundancy))
+
+
+def without_unseen_turns(
+    errors: RotationErrors, problem: AdjustmentProblem, options: AdjustmentOptions, fitting: FloatArray
+) -> RotationErrors:
+    """Return the errors as far as the pixels show them; see the header.
+
+    Args:
+        errors: of `estimate_rotation_errors`.
+        problem, options: as there.
+        fitting: (n,) share of each frame's observations of the points that fit these.
+    """
+    are_doubted = errors.sigma_rad > 0.0 or errors.are_wrong.any() or np.any(fitting < _SEEN)
+    if not (are_doubted and errors.chance_rad > 0.0):
+        return errors
+    bare, options = replace(problem, rotation_prior=None), replace(options, cost_tolerance=_FALL)
+    assert options.loss_scale_px is not None
+    free = adjust(bare, options, hold_rotations=False).problem
+    turns = (errors.sigma_rad * ~problem.fixed[:, None]) * np.random.default_rng(0).standard_normal(
+        (problem.num_frames, 3)
+    )
+    turned = replace(free, rotations=rotations_of(turns) @ free.rotations)
+    freed, held, worse = (
+        costs_of_frames(end, options.loss_scale_px)
+        for end in (free, *(adjust(one, options, hold_rotations=True).problem for one in (bare, turned)))
+    )
+    rise = float(np.sum(worse - freed))
+    seen = float(np.clip(np.sum(held - freed) / rise, 0.0, 1.0)) if rise > 0.0 else 0.0
+    if seen >= _SEEN:
+        return errors
+    least = np.where(errors.are_wrong, _BETTER, _CLEARLY_BETTER)
+    are_wrong = ~problem.fixed & (held > least * fitting * freed)
+    sigmas = np.where(are_wrong, np.inf, 0.0)
+    return replace(errors, sigma_rad=0.0, frame_sigmas_rad=sigmas, are_wrong=are_wrong)
 
 
 class _Halves(NamedTuple):

@@ -34,10 +34,14 @@ def errors_of_free_lenses(
     """
     free = estimate_covariances(problem, options, **freedom.overrides())
     held = estimate_covariances(problem, options, deciding=free.deciding)
-    more = np.nan_to_num(free.centers - held.centers)
+    return excess(free.centers, held.centers), focal_shares(problem, free)
+
+
+def excess(larger: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return by what covariances (n, 3, 3) are larger than others, where they are; 0 where either is NaN."""
+    more = np.nan_to_num(larger - covariances)
     values, axes = np.linalg.eigh(0.5 * (more + more.transpose(0, 2, 1)))
-    added = (axes * np.maximum(values, 0.0)[:, None]) @ axes.transpose(0, 2, 1)
-    return added, focal_shares(problem, free)
+    return np.asarray((axes * np.maximum(values, 0.0)[:, None]) @ axes.transpose(0, 2, 1))
 
 
 def covariances_of_open_lenses(

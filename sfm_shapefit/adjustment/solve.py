@@ -158,10 +158,10 @@ def frames_not_gained(before: AdjustmentProblem, after: AdjustmentProblem, loss_
     have been led over a ridge by the others. Both are the same problem in the same gauge.
     """
     returned = replace(after, rotations=before.rotations, centers=before.centers)
-    return _costs_of_frames(returned, loss_scale_px) < _costs_of_frames(after, loss_scale_px)
+    return costs_of_frames(returned, loss_scale_px) < costs_of_frames(after, loss_scale_px)
 
 
-def _costs_of_frames(problem: AdjustmentProblem, loss_scale_px: float) -> FloatArray:
+def costs_of_frames(problem: AdjustmentProblem, loss_scale_px: float) -> FloatArray:
     """Return the cost of each frame's observations (n,), px^2."""
     errors_px = np.nan_to_num(reprojection_errors_px(problem), nan=_BEHIND_PX)
     losses = 0.5 * loss_scale_px**2 * np.log1p((errors_px / loss_scale_px) ** 2)

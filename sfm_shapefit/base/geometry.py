@@ -17,6 +17,9 @@ MEDIAN_NORMAL_LENGTH = 1.538
 METRIC_SIGMA = 0.1
 """Relative standard deviation up to which a scale counts as known; a rough one is told with a warning."""
 
+INSIDE = 30.0
+"""Median distances from the median; cameras and points within say how large the scene is."""
+
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])
 """Turn of camera axes about x, its own inverse: y up, looking along -z (OpenGL, NeRF), to COLMAP's."""
 
@@ -157,6 +160,12 @@ def distances_in_spreads(points: FloatArray, reference: FloatArray) -> FloatArra
     """Return the distances of points (n, d) from the median of others, (n,), in median spreads of these."""
     distances = np.linalg.norm(points - np.median(reference, axis=0), axis=1)
     return np.asarray(distances / max(median_spread(reference), np.finfo(np.float64).tiny))
+
+
+def extent_of(points: FloatArray) -> float:
+    """Return the diagonal of the box around points (n, d), without those that fly far outside."""
+    inside = points[distances_in_spreads(points, points) <= INSIDE]
+    return float(np.linalg.norm(np.ptp(inside, axis=0)))
 
 
 def fit_similarity_l1(

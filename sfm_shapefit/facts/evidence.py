@@ -7,7 +7,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, rounded
-from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion
+from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape, SecondOpinion, how_far
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
@@ -157,6 +157,23 @@ class ToldOpinion(Record):
         return f"{told} ({usual})"
 
 
+class ToldShape(Record):
+    """How far a model goes at equal fit once lenses, which nothing measured, and rotations are free."""
+
+    images: Annotated[tuple[str, ...], "Images whose centers it leaves open by more than 5 % of the extent."]
+    largest: Annotated[float, "Largest standard deviation of a center by that, as a share of the extent."]
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        return (
+            f"the points leave open where {counted(len(self.images), 'camera')} "
+            f"stand{'s' * (len(self.images) == 1)} ({first_of(self.images)}): with lenses and rotations free "
+            f"they fit as well {how_far(self.largest)} away; calibrate the cameras, or add images that turn "
+            "and cross"
+        )
+
+
 class ToldEvidence(Record):
     """Evidence that the fit did not use, against lenses, cameras and groups by name."""
 
@@ -166,6 +183,9 @@ class ToldEvidence(Record):
     untied: Annotated[tuple[UntiedGroup, ...], "Groups of cameras that little ties to the rest."] = ()
     contradicted: Annotated[tuple[str, ...], "Images that many pairs contradict, and no points confirm."] = ()
     second: Annotated[ToldOpinion | None, "How another model of the same matches compares."] = None
+    shape: Annotated[
+        ToldShape | None, "How far the points leave the shape open; null where lenses are measured."
+    ] = None
 
     @property
     def apart(self) -> list[tuple[str, ...]]:
@@ -184,6 +204,8 @@ class ToldEvidence(Record):
         second = self.second
         if second is not None and (second.wrong or second.undecided or second.ambiguous):
             told.append(second.statement)
+        if self.shape is not None and self.shape.images:
+            told.append(self.shape.statement)
         if self.contradicted:
             told.append(
                 f"{_cameras(self.contradicted)} where many pairs contradict, and no points confirm it"
@@ -215,7 +237,12 @@ def tell_evidence(
         untied=tuple(UntiedGroup(**_tell_group(group, images)) for group in evidence.untied),
         contradicted=tuple(images.names[one.camera] for one in evidence.contradicted),
         second=None if evidence.second is None else _tell_opinion(evidence.second, images),
+        shape=None if evidence.shape is None else _tell_shape(evidence.shape, images),
     )
+
+
+def _tell_shape(shape: OpenShape, images: Images) -> ToldShape:
+    return ToldShape(images=tuple(images.names[k] for k in shape.cameras.tolist()), largest=shape.largest)
 
 
 def _tell_group(group: Seam | Untied, images: Images) -> dict[str, Any]:

@@ -224,6 +224,9 @@ class FactsOfModel(Facts):
             f"{against[0]:,} of {counted(against[1], 'pair')} contradict{'s' * (against[1] == 1)} the result"
         )
         contradict = contradict if against[1] else "no pair says where cameras stand"
+        silent = self.num_pairs - against[1]
+        if silent > against[1] > 0:
+            contradict += f", and {silent:,} of {self.num_pairs:,} pairs say nothing of it"
         return [
             f"{self.num_placed:,} of {counted(self.num_images, 'image')} placed, "
             f"{counted(self.num_points, 'point')}{points}",

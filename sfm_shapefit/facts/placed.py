@@ -17,7 +17,7 @@ import numpy as np
 from sfm_shapefit import __version__
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
-from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
+from sfm_shapefit.base.geometry import extent_of, fit_similarity_l1, median_spread
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded
 from sfm_shapefit.facts.tables import CameraRow
@@ -90,10 +90,10 @@ class KeyFigures(Record):
         """
         placed = [camera for camera in cameras if camera.placed]
         centers = np.array([camera.center for camera in placed if camera.center])
-        extent = float(np.linalg.norm(np.ptp(centers, axis=0))) if len(centers) else 0.0
-        largest = [max(camera.sigma) for camera in placed if camera.sigma and max(camera.sigma) > 0.0]
-        known = [sigma for sigma in largest if math.isfinite(sigma)]
+        extent = extent_of(centers) if len(centers) else 0.0
+        known = [max(camera.sigma) for camera in placed if camera.sigma and max(camera.sigma) > 0.0]
         sigma = float(np.median(known)) if known else math.nan
+        sigma = sigma if math.isfinite(sigma) else math.nan
         error_deg = math.nan if pair_error_deg is None else pair_error_deg
         return cls(
             pair_error_deg=error_deg,

@@ -315,7 +315,7 @@ class LocateResult(_Placed):
             *of_each(Kind.POINTS, lone, NO_SUPPORT),
             *weigh_evidence(self.evidence, self.placed),
         )
-        repeats = tuple(match_warnings(self.directions))[:1]
+        repeats = tuple(match_warnings(self.directions, may_repeat=self.database is not None))[:1]
         repeated = (of_model(Kind.REPEATED, sentence) for sentence in repeats)
         lacks = () if self.model.num_points3D() else (of_model(Kind.POINTS, NO_POINTS),)
         after = (*repeated, *self._off_priors(), *lacks, *self.suspicions)

@@ -96,11 +96,14 @@ def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
         )
 
 
-def match_warnings(directions: PairDirections) -> Iterator[str]:
-    """Yield what the matches of all pairs together say against any answer, if they do."""
+def match_warnings(directions: PairDirections, *, may_repeat: bool) -> Iterator[str]:
+    """Yield what the matches of all pairs together say against any answer, if they do.
+
+    The tracks of a model, for which it `may_repeat` nothing, were made for one answer.
+    """
     counts = directions.counts()
     usable, twofold = (counts.get(s, 0) for s in (DirectionStatus.USABLE, DirectionStatus.TWO_MOTIONS))
-    if twofold >= _FEWEST_TWOFOLD and twofold > _TWOFOLD_SHARE * (usable + twofold):
+    if may_repeat and twofold >= _FEWEST_TWOFOLD and twofold > _TWOFOLD_SHARE * (usable + twofold):
         yield (
             f"the matches of {twofold} pairs agree on two directions each, those of {usable} on one: things "
             "move, or a facade repeats, which may shift whole groups of cameras by its period and leave no "
@@ -109,8 +112,9 @@ def match_warnings(directions: PairDirections) -> Iterator[str]:
     against = counts.get(DirectionStatus.LOW_INLIER_RATIO, 0)
     if against > _ALARMING_SHARE * len(directions.pairs):
         yield (
-            f"the matches of {against} of {len(directions.pairs)} pairs contradict the rotations: the scene "
-            "repeats itself, rotations or intrinsics are wrong, or the matches are those of another scene"
+            f"the matches of {against} of {len(directions.pairs)} pairs contradict the rotations: "
+            + ("the scene repeats itself, " if may_repeat else "")
+            + "rotations or intrinsics are wrong, or the matches are those of another scene"
         )
 
 

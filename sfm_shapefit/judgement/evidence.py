@@ -14,13 +14,14 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
+from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, extent_of, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
-from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, OUTNUMBERED, SIGMAS, SURE_SIGMAS
+from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, OUTNUMBERED, RARE, SIGMAS, SURE_SIGMAS
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
+from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.scene.images import Images
@@ -165,6 +166,30 @@ class SecondOpinion(NamedTuple):
         return self.usual > FEW and not (len(self.wrong) or len(self.undecided) or len(self.ambiguous))
 
 
+class OpenShape(NamedTuple):
+    """What the points leave open of a model's shape, see `adjustment.open_shape`."""
+
+    covariances: FloatArray
+    """Covariances (n, 3, 3) of the centers, beside what noise does, in squared units; 0 without a pose."""
+    cameras: IntArray
+    """Rows of those whose largest standard deviation, by noise too, is above 5 % of the extent."""
+    largest: float
+    """The largest of all, as a share of the extent."""
+
+    @classmethod
+    def of(cls, images: Images, rows: IntArray, more: FloatArray, every: FloatArray) -> "OpenShape":
+        """Return what is left open of the posed images, by their rows (r,); `every` is with noise."""
+        covariances = np.zeros((images.num_images, 3, 3))
+        covariances[rows] = more
+        sigmas = standard_deviations(every).max(axis=1) / extent_of(images.centers[rows])
+        return cls(covariances, np.sort(rows[sigmas > RARE]), float(sigmas.max()))
+
+
+def how_far(share: float) -> str:
+    """Say a share of the extent."""
+    return f"by {share:.0%} of the extent" if share <= 1.0 else "by more than the extent"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModelEvidence:
     """What speaks against a model although it fits."""
@@ -183,6 +208,8 @@ class ModelEvidence:
     """Cameras of the largest group that agreeing pairs, or points that fit, hold; None without pairs."""
     second: SecondOpinion | None = None
     """How another model of the same matches compares; None if there is none."""
+    shape: OpenShape | None = None
+    """What the points leave open, where nothing else measured lenses; None where that is not asked."""
 
     def beside(self, second: SecondOpinion, contradicting: IntArray) -> "ModelEvidence":
         """Return the same with a second opinion, without what that clears; `contradicting` is (b, 2) pairs.

@@ -42,14 +42,13 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.geometry import distances_in_spreads
+from sfm_shapefit.base.geometry import extent_of
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.evidence import ModelEvidence, how_far
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import (
     FEW,
     HALF,
-    INSIDE,
     KNOWN_DEG,
     MANY,
     RARE,
@@ -109,6 +108,9 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     if lenses:
         clause = f"images contradict {counted(len(lenses), 'focal length')}"
         yield of_model(Kind.LENS, clause, images=names(through.tolist()))
+    if evidence.shape is not None and len(evidence.shape.cameras):
+        clause = f"its own points leave the shape open, {how_far(evidence.shape.largest)}"
+        yield of_model(Kind.UNCERTAIN, clause, images=names(evidence.shape.cameras.tolist()))
     for one in evidence.contradicted:
         clause = f"{one.num_against} of its {one.num_pairs} pairs contradict where it stands"
         yield from of_each(Kind.PAIRS, names([one.camera]), clause)
@@ -211,15 +213,9 @@ def uncertain_cameras(placement: Judged) -> IntArray:
     """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
     if len(placement.cameras) < SMALLEST_PIECE:
         return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(largest_sigmas(placement) > RARE * _extent(placement.locations))
+    return np.flatnonzero(largest_sigmas(placement) > RARE * extent_of(placement.locations))
 
 
 def largest_sigmas(placement: Judged) -> FloatArray:
     """Return the largest of each camera's standard deviations along the axes."""
     return np.asarray(standard_deviations(placement.covariances).max(axis=1))
-
-
-def _extent(locations: FloatArray) -> float:
-    """Return the diagonal of the box around locations (n, d), without those that fly far outside."""
-    inside = locations[distances_in_spreads(locations, locations) <= INSIDE]
-    return float(np.linalg.norm(np.ptp(inside, axis=0)))

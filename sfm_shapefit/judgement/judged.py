@@ -6,6 +6,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
 from sfm_shapefit.base.blas_threads import one_blas_thread
+from sfm_shapefit.base.geometry import extent_of
 from sfm_shapefit.judgement.limits import KNOWN_DEG
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.placement.place import Placement
@@ -29,6 +30,8 @@ class Judged(Placement):
     """What these covariances take errors of the lenses for."""
     scale_sigma: float | None = None
     """Relative standard deviation of the scale, where an adjustment knows it, or pairs hardly do."""
+    open_covariances: FloatArray | float = 0.0
+    """(k, 3, 3) what the shape leaves open of the centers beside, squared solver's units; 0 if not asked."""
 
     def loosened(self, loose: BoolArray) -> "Judged":
         """Return the same where nothing says how some of the cameras (k,) stand to the rest."""
@@ -50,13 +53,15 @@ class Judged(Placement):
     def covariances(self) -> FloatArray:
         """Covariances (k, d, d) of `locations`: of an adjustment, else from the noise of directions only.
 
+        What an open shape adds is in them.
+
         They are infinite where a standard deviation is larger than the scene: nothing holds such a camera.
         """
         found = self.assessment.covariances[: len(self.cameras)]
         if self.adjusted_covariances is not None:
             known = np.isfinite(self.adjusted_covariances).all(axis=(1, 2), keepdims=True)
             found = np.where(known, self.adjusted_covariances, found)
-        extent = np.linalg.norm(np.ptp(self.locations, axis=0))
+        found, extent = found + self.open_covariances, extent_of(self.locations)
         lost = np.einsum("kaa->ka", found).max(axis=1) > extent**2
         return np.where(lost[:, None, None], np.inf, found)
 

@@ -34,7 +34,5 @@ SMALLEST_SHAPE = 3
 """Cameras, frames or images; fewer have no shape, or no half."""
 FITTING_PX = 4.0
 """Pixels; what misses its point by more does not fit, as COLMAP has it."""
-INSIDE = 30.0
-"""Median distances from the median; cameras and points within say how large the scene is."""
 MOST_COMPARED = 300
 """Turns that are compared with one another; the time grows with the square."""

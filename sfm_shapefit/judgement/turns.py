@@ -46,7 +46,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
 from sfm_shapefit.base.geometry import nearest_rotations, rotation_angles_deg
 from sfm_shapefit.judgement.bodies import find_bodies
-from sfm_shapefit.judgement.limits import ALIKE_DEG, HALF, KNOWN_DEG, MOST_COMPARED, RARE
+from sfm_shapefit.judgement.limits import ALIKE_DEG, HALF, KNOWN_DEG, MANY, MOST_COMPARED, RARE
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import LAST_WIDTH_PX
@@ -115,11 +115,17 @@ class Doubts:
         """Return the cameras of a camera's body, ascending."""
         return np.flatnonzero(self.bodies == self.bodies[camera])
 
+    def without_repetition(self) -> "Doubts":
+        """Return the same where the scene cannot repeat itself: what is ambiguous is not known."""
+        kinds = (Doubt.UNKNOWN if kind is Doubt.AMBIGUOUS else kind for kind in self.kinds)
+        return replace(self, kinds=tuple(kinds))
+
     def without(self, sure: BoolArray) -> "Doubts":
         """Return the doubts of the other cameras: those that are `sure` (n,) are right and in no body."""
         kinds = (Doubt.RIGHT if is_sure else k for is_sure, k in zip(sure.tolist(), self.kinds, strict=True))
         bodies = np.where(sure, -1 - np.arange(len(sure)), self.bodies)
-        return replace(self, kinds=tuple(kinds), bodies=bodies)
+        placed, turned = np.where(sure, 1.0, self.placed), np.where(sure, 0.0, self.turned)
+        return replace(self, kinds=tuple(kinds), bodies=bodies, placed=placed, turned=turned)
 
 
 def fit_as_placed(directions: PairDirections) -> FloatArray:
@@ -160,6 +166,9 @@ def weigh_pairs(
         (fit_as_placed(directions) / fit_best - _UNEXPLAINED) / (_EXPLAINED - _UNEXPLAINED), 0.0, 1.0
     )
     usable = is_usable(directions.status)
+    # A pair whose matches are as far off as it would turn, along its baseline, takes parallax for a turn.
+    parallax = np.radians(np.nan_to_num(directions.parallax_deg))
+    sigmas[(np.nan_to_num(agreements) == 1.0) & (_angles(turns) > (1.0 - MANY) * parallax)] = np.inf
     small = _angles(turns) <= np.maximum(_AGREEING_SIGMAS * sigmas, _LEAST_TURN_RAD)
     finite = np.isfinite(sigmas)
     judged = usable & np.isfinite(agreements)

@@ -13,10 +13,10 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import METRIC_SIGMA, distances_in_spreads, tangent_bases
+from sfm_shapefit.base.geometry import INSIDE, METRIC_SIGMA, distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
-from sfm_shapefit.judgement.limits import INSIDE, SMALLEST_SHAPE
+from sfm_shapefit.judgement.limits import SMALLEST_SHAPE
 from sfm_shapefit.judgement.trust import CameraTrust, judge_cameras
 from sfm_shapefit.judgement.turns import Doubt, Doubts
 from sfm_shapefit.judgement.uncertainty import (

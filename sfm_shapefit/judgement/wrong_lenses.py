@@ -7,13 +7,17 @@ shows less than that the images ask for unlike ones: it is wrong if half of them
 three deviations. With right lenses, no image of 17 scenes changed by ten deviations, and half of those of a
 lens changed by 0.2 % at most, or by two deviations; with all lenses wrong by 0.8 to 1.3 and the points
 adjusted to that, half of them changed by 0.5 % or more.
+
+Poses that are rough, as of a network, put their errors on one lens. So it takes ten deviations all the same
+to ask for a focal length that leaves the range of like lenses, by more than 2.5 % and three deviations; like
+ones have the same model and size, and took one image each.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
 from sfm_shapefit.judgement.limits import HALF, OUTNUMBERED, SIGMAS, SMALLEST_SHAPE
@@ -38,6 +42,31 @@ class WrongLens(NamedTuple):
     """Images that were asked."""
     score: float
     """Change in standard deviations, the median one of its images."""
+
+
+def is_like_others(images: Images, lens: int, focal_px: float, sigma: float) -> bool:
+    """Return whether a focal length, known to a share `sigma`, is in the range of like lenses, or has few."""
+    single = np.bincount(images.lens_of, minlength=len(images.lenses)) == 1
+    own = images.lenses[lens]
+    like = [
+        one.focal_px
+        for k, one in enumerate(images.lenses)
+        if single[k]
+        and k != lens
+        and (one.model, one.width, one.height) == (own.model, own.width, own.height)
+    ]
+    if not single[lens] or len(like) < SMALLEST_SHAPE:
+        return True
+    margin = (1.0 + _ONE[0]) * (1.0 + SIGMAS * sigma)
+    return min(like) / margin <= focal_px <= max(like) * margin
+
+
+def _ask_for_like(left_out: LeftOut, images: Images, lens: int, rows: IntArray) -> bool:
+    """Return whether images of a lens ask for a focal length in the range of like ones."""
+    if not len(rows):
+        return True
+    factor, sigma = np.exp(np.median(left_out.log_factors[rows])), left_out.sigmas[rows].max()
+    return is_like_others(images, lens, float(factor * images.lenses[lens].focal_px), float(sigma))
 
 
 def question_lenses(
@@ -80,8 +109,9 @@ def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
         if len(rows) >= SMALLEST_SHAPE:
             least, deviations = _HALF
         elif own.sum() < SMALLEST_SHAPE and len(others) >= SMALLEST_SHAPE:
-            deviations = min(deviations, clear)
-            rows = np.flatnonzero(own & (left_out.observable | (scores > clear)))
+            some = np.flatnonzero(own & (left_out.observable | (scores > clear)))
+            if _ask_for_like(left_out, images, lens, some):
+                deviations, rows = min(deviations, clear), some
         if not len(rows):
             continue
         changes = left_out.log_factors[rows]

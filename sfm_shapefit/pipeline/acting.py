@@ -14,6 +14,7 @@ import numpy as np
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.limits import OUTNUMBERED
+from sfm_shapefit.judgement.wrong_lenses import is_like_others
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, measure_hold
@@ -29,8 +30,9 @@ class Remedy(NamedTuple):
 
     given: Given
     source: MatchSource
-    freed: tuple[int, ...]
-    """Rows of the lenses that may change now, and start from the focal length that their images ask for."""
+    freed: dict[int, float]
+    """Rows of the lenses that may change now, and start from the focal length that their images ask for; with
+    the standard deviation of that, a share, which the roughness of poses widens."""
     moved: tuple[str, ...]
     """Names of cameras whose pairs for this place are left out, as twice as many agree on another."""
 
@@ -42,11 +44,19 @@ class Remedy(NamedTuple):
         moved = f"{', '.join(self.moved)}: placed without the pairs that twice as many contradict"
         return (*told, *([moved] if self.moved else []))
 
+    def widened(self, found: LocateResult) -> LocateResult:
+        """Return a result whose freed focal lengths are known no better than left-out images tell them."""
+        sigmas = found.intrinsics.focal_sigmas.copy()
+        for row, sigma in self.freed.items():
+            sigmas[row] = np.maximum(sigmas[row], sigma)
+        return replace(found, intrinsics=replace(found.intrinsics, focal_sigmas=sigmas))
+
     def cures(self, after: LocateResult, before: LocateResult) -> bool:
         """Return whether less speaks against a result than before, with lenses known and no camera lost."""
-        less = _count(after) < _count(before)
+        less, images = _count(after) < _count(before), after.images
         open_ = after.intrinsics.undetermined[list(self.freed)].any()
-        return bool(less and not open_ and after.kept.sum() >= before.kept.sum())
+        alike = all(is_like_others(images, k, images.lenses[k].focal_px, s) for k, s in self.freed.items())
+        return bool(less and alike and not open_ and after.kept.sum() >= before.kept.sum())
 
 
 def act(
@@ -69,6 +79,7 @@ def act(
     again = place(remedy.given, remedy.source)
     if not remedy.cures(again, found):
         return found
+    again = remedy.widened(again)
     return replace(again, warnings=(*remedy.told(again), *again.warnings))
 
 
@@ -113,7 +124,7 @@ def find_remedy(
     images, intrinsics = source.images, given.intrinsics
     may_free = options.freedom.intrinsics != "held" and options.freedom.adjusts_cameras(images.num_images)
     freed = {
-        wrong.lens: wrong.factor
+        wrong.lens: wrong
         for wrong in found.evidence.lenses
         if may_free and images.lenses[wrong.lens].is_adjustable and not intrinsics.parts[wrong.lens, FOCAL]
     }
@@ -124,11 +135,11 @@ def find_remedy(
     if not (freed or moved):
         return None
     lenses, parts = list(images.lenses), intrinsics.parts.copy()
-    for row, factor in freed.items():
+    for row, wrong in freed.items():
         known = lenses[row]
         if known.origin in (None, Origin.CALIBRATION):  # what is contradicted pulls no harder than a guess
             known = replace(known.in_doubt(Origin.GUESS), origin=Origin.CALIBRATION)
-        lenses[row] = known.longer(factor)
+        lenses[row] = known.longer(wrong.factor)
         parts[row, FOCAL] = True
     pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(place.pairs_here for place in moved)])
     names = ((images.names[i], images.names[j]) for i, j in pairs.tolist())
@@ -138,7 +149,7 @@ def find_remedy(
     return Remedy(
         given._replace(inputs=inputs, intrinsics=replace(intrinsics, parts=parts)),
         replace(source, inputs=inputs, view=view),
-        tuple(freed),
+        {row: wrong.sigma for row, wrong in freed.items()},
         tuple(images.names[place.camera] for place in moved),
     )
 

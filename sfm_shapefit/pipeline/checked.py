@@ -15,7 +15,7 @@ scripts/results/notes.md.
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,6 +24,7 @@ import numpy as np
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results have reports
 from sfm_shapefit import __version__
+from sfm_shapefit.adjustment.sources import collect_tracks
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
@@ -53,7 +54,7 @@ from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.conventions import ask_convention
-from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence
+from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, ask_shape, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
@@ -137,6 +138,10 @@ def check_source(
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     with clock("evidence"):
         evidence = gather_evidence(matches, fits, structure, clock.threads)
+        if not matches.has_database:
+            tracks = collect_tracks(model.images, pictures, structure.points)
+            rows = np.arange(model.images.num_images)
+            evidence = replace(evidence, shape=ask_shape(model.images, rows, tracks))
         weak = list(_find_weak(model.images, quality))
         second = None if fits is None or other is None else _compare(matches, fits, structure, other)
         if fits is not None and second is not None:

@@ -108,10 +108,12 @@ def doubt_cameras(
     directions: PairDirections,
     relative: RelativeRotations | None,
     images: Images,
+    sure: BoolArray | None = None,
 ) -> Judged:
     """Return the placement with a trust that follows what the pairs say of the rotations.
 
-    What `ask_pairs` returned is `relative`; if None, the given rotations are believed.
+    What `ask_pairs` returned is `relative`; if None, the given rotations are believed. Pairs of a model's own
+    tracks hold no second scene, and say nothing of cameras (k,) that are `sure`; None: pairs of a database.
     """
     if relative is None:
         return replace(placement, assessment=believe_rotations(placement.assessment))
@@ -126,6 +128,7 @@ def doubt_cameras(
         _, labels = np.unique(placement.groups.group_of[placement.cameras], return_inverse=True)
     guesses = np.array([_is_guess(lens) for lens in images.lenses])[images.lens_of[placement.cameras]]
     doubts = replace(find_turned(pairs, labels), guessed=guesses)
+    doubts = doubts if sure is None else doubts.without(sure).without_repetition()
     return replace(placement, assessment=weigh_doubts(placement.assessment, doubts))
 
 

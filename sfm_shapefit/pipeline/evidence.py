@@ -4,9 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.open_shape import estimate_open_shape
+from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.base.arrays import BoolArray, IntArray
-from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
-from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED
+from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape, PairFits
+from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED, SMALLEST_SHAPE
 from sfm_shapefit.judgement.seams import Seam, find_cuts, find_seams
 from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, links_of_pairs, rigid_groups
 from sfm_shapefit.judgement.witnesses import are_confirmed
@@ -17,6 +19,7 @@ from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.matches import View
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
+from sfm_shapefit.tracks.links import ObservedTracks
 
 _MOST_ASKED = 200  # images of a lens that are left out; each takes 1.4 ms, and a median of so many is exact
 
@@ -65,6 +68,24 @@ def gather_evidence(
         untied=tuple(one for one in untied if 2 * np.isin(one.cameras, apart).sum() < len(one.cameras)),
         num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)),
     )
+
+
+def ask_shape(
+    images: Images, rows: IntArray, tracks: Links, *, lenses_held: bool = False, rotations_held: bool = False
+) -> OpenShape | None:
+    """Return what own tracks leave open of where the posed images stand; None if that is not known.
+
+    Args:
+        images: all.
+        rows: (r,) of those with a pose, which the tracks have in that order.
+        tracks: of the model's points.
+        lenses_held, rotations_held: whether the user knows these.
+    """
+    if not isinstance(tracks, ObservedTracks) or len(rows) < SMALLEST_SHAPE:
+        return None
+    held = {"lenses_held": lenses_held, "rotations_held": rotations_held}
+    found = None if all(held.values()) else estimate_open_shape(images.part(rows), tracks, **held)
+    return None if found is None else OpenShape.of(images, rows, *found)
 
 
 def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:

@@ -20,6 +20,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.base.geometry import fit_similarity, fit_similarity_l1, median_spread
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
@@ -39,7 +40,7 @@ from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.doubted import confirm_cameras
-from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
+from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape, fit_pairs
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.judgement.limits import RARE
 from sfm_shapefit.judgement.reasons import Kind, of_model
@@ -48,7 +49,7 @@ from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_cameras, turned_deg, with_uncertainty
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
-from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence, rigid_strip
+from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, ask_shape, gather_evidence, rigid_strip
 from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE
 from sfm_shapefit.pipeline.given import Given
@@ -66,7 +67,7 @@ from sfm_shapefit.pipeline.measure import (
 from sfm_shapefit.pipeline.memory import describe_work, keep_within_memory
 from sfm_shapefit.pipeline.rigs import may_be_checked, place_by_checked, place_cameras
 from sfm_shapefit.pipeline.seed import Seeded, seed_points, select_trusted
-from sfm_shapefit.pipeline.stand import Stand
+from sfm_shapefit.pipeline.stand import Stand, posed_part
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, Gauge, coincide, tell_scale
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_fit import PriorFit, compare_with_priors
@@ -168,6 +169,9 @@ def finish_piece(
     kept &= images.is_posed[judged.cameras]
     with clock("trust"):
         evidence = _question(stand, kept, seeded, clock)
+        if not source.has_database:
+            shape = _ask_shape(stand, images, lenses_held=options.freedom.intrinsics == "held")
+            evidence, judged = replace(evidence, shape=shape), _widened(judged, shape, gauge.similarity.scale)
         for group in (group for group in evidence.untied if group.is_loose):
             judged = judged.loosened(np.isin(judged.cameras, group.cameras))
     with clock("model"):
@@ -232,13 +236,16 @@ def _adjust(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
 
 def _judge(stand: Stand, options: PlacingOptions, before: Images, clock: Clock) -> Judged:
     """Return the evidence for a piece where its cameras stand, without the samples of errors that it took."""
-    placement, source, relative = stand.placement, stand.source, None
-    if not stand.given.believes_rotations:
+    placement, source, relative, fit = stand.placement, stand.source, None, stand.fit_rotations
+    if not (stand.given.believes_rotations or fit.all()):
         relative = ask_pairs(source, stand.directions, clock.threads, stand.among)
     judged = judge(placement, source.economy.limit(options.placement))
+    if not source.has_database:  # its points were made for one placement, and hold no second one
+        judged = replace(judged, second_configuration=None)
     if stand.estimate is not None:
         judged = with_uncertainty(judged, before, stand.estimate, stand.scale)
-    return doubt_cameras(judged.without_error_samples(), stand.directions, relative, source.images)
+    judged, sure = judged.without_error_samples(), None if source.has_database else fit[judged.cameras]
+    return doubt_cameras(judged, stand.directions, relative, source.images, sure)
 
 
 def _choose(stand: Stand, judged: Judged, min_trust: float) -> tuple[BoolArray, Stand]:
@@ -285,6 +292,23 @@ def _question(stand: Stand, kept: BoolArray, seeded: Seeded, clock: Clock) -> Mo
     return gather_evidence(source, fits, structure, clock.threads)
 
 
+def _ask_shape(stand: Stand, images: Images, *, lenses_held: bool) -> OpenShape | None:
+    """Return what own tracks leave open of the delivered images, where nothing else holds their shape."""
+    posed, given = posed_part(images), stand.given
+    if stand.held is not None or given.fixed_frames.any():
+        return None
+    links = stand.read_links(posed, nobody)
+    knows_rotations = given.pull_rad is not None and given.pull_rad < np.inf
+    return ask_shape(images, posed.rows, links, lenses_held=lenses_held, rotations_held=knows_rotations)
+
+
+def _widened(judged: Judged, shape: OpenShape | None, scale: float) -> Judged:
+    """Return the piece with what its shape leaves open, `scale` from the solver's unit."""
+    if shape is None:
+        return judged
+    return replace(judged, open_covariances=shape.covariances[judged.cameras] / scale**2)
+
+
 def _tied_by_priors(stand: Stand, images: Images) -> IntArray | None:
     """Return pairs (k, 2) of images that priors tie: those whose own is as certain as a camera should be."""
     if stand.held is None:
@@ -329,7 +353,7 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
     images, rule, gauge = found.placed, stand.given.rule, found.gauge
     yield from found.told_evidence.statements
     yield from intrinsics_warnings(found.intrinsics.rows(images))
-    yield from match_warnings(stand.directions)
+    yield from match_warnings(stand.directions, may_repeat=stand.source.has_database)
     yield from quality_warnings(found.placement)
     yield from trust_warnings(found.placement, found.kept)
     yield from ambiguity_warnings(found.placement)

@@ -78,6 +78,14 @@ class Stand(NamedTuple):
         """The images whose matches are read: of a further piece, which is small, its own; None for all."""
         return self.placement.cameras if self.placement.piece else None
 
+    @property
+    def fit_rotations(self) -> BoolArray:
+        """Images (i,) whose rotations the model's own tracks fit as well as any: these ask for no turns."""
+        frames, done = np.zeros(len(self.given.images.frames.ids), dtype=np.bool_), self.adjustment
+        if not self.source.has_database and done and done.errors and done.errors.sigma_rad == 0.0:
+            frames |= ~self.freedom.singled_out()
+        return np.asarray(frames[self.given.images.frame_of])
+
     def failed(self, how: str) -> "Stand":
         """Return the same without a step that failed; `how` says which and why, a clause."""
         return self._replace(failures=(*self.failures, how))

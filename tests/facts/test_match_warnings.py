@@ -79,8 +79,14 @@ def test_a_wall_that_repeats_inside_pairs_is_warned_of_and_any_other_wall_is_not
     ],
 )
 def test_warnings_need_a_share_of_the_pairs_and_more_than_one_or_two_and_give_numbers(counts, said):
-    for warning, words in zip(match_warnings(statuses(**counts)), said, strict=True):
+    for warning, words in zip(match_warnings(statuses(**counts), may_repeat=True), said, strict=True):
         assert words in warning
+
+
+def test_own_tracks_repeat_nothing():
+    assert not list(match_warnings(statuses(USABLE=8, TWO_MOTIONS=3), may_repeat=False))
+    (warning,) = match_warnings(statuses(USABLE=4, LOW_INLIER_RATIO=5), may_repeat=False)
+    assert "repeats" not in warning
 
 
 @pytest.mark.parametrize(

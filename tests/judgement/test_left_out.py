@@ -1,5 +1,7 @@
 """Leave one out: an image against the points as the others make them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -168,7 +170,10 @@ def test_five_deviations_do_where_no_other_image_is_near_them(others, num_others
     changes[0], sigmas[0], free[0] = 0.2, 0.04, 1e-6  # a camera that stands nearer hides nearly all
     free[1 + num_others :] = 1e-6
     left_out = LeftOut(np.full(NUM_IMAGES, 100), changes, sigmas, free, np.ones(NUM_IMAGES))
-    assert [one.lens for one in wrong_lenses(left_out, Scene().images)] == [0] * is_named
+    alike = Scene().images
+    unlike = alike.with_lenses([replace(alike.lenses[0], width=2), *alike.lenses[1:]])
+    assert [one.lens for one in wrong_lenses(left_out, unlike)] == [0] * is_named
+    assert wrong_lenses(left_out, alike) == ()  # the others, of the same size, have no such focal length
 
 
 def test_a_lens_of_all_images_is_wrong_if_they_ask_for_unlike_ones():

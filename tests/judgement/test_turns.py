@@ -133,3 +133,14 @@ def test_pairs_are_weighed_by_rotation_fit_and_direction():
     assert np.isinf(found.sigmas_rad[4])
     # The information of 20 matches of 100, and 0.1 degrees.
     np.testing.assert_allclose(found.sigmas_rad[0], np.hypot(np.sqrt(5e-8), np.radians(0.1)))
+
+
+@pytest.mark.parametrize(("parallax_deg", "votes"), [(12.0, False), (40.0, True)])
+def test_a_pair_does_not_take_its_parallax_for_a_turn(parallax_deg, votes):
+    """A patch seen under 12 degrees of parallax along the baseline may as well be turned by 10."""
+    rotations, pairs = random_rotations(np.random.default_rng(9), 2), np.array([(0, 1)])
+    wrong = turn(np.array([0.0, 1.0, 0.0]), 10.0)
+    own = rotations[1:] @ wrong @ rotations[0].T
+    directions = made_directions(pairs, np.array([[1.0, 0.0, 0.0]]), parallax_deg=np.array([parallax_deg]))
+    found = weigh_pairs(directions, np.ones(1), made_rotations(pairs, own), rotations)
+    assert np.isfinite(found.sigmas_rad[0]) == votes

@@ -179,6 +179,7 @@ def test_judge_names_the_pairs_that_contradict_and_who_is_turned_by_what_its_pai
     (bent,) = place_cameras(measured, PlacementOptions(), NodeOptions(), Clock())
     assert np.flatnonzero(~judge(bent, PlacementOptions()).assessment.inliers).tolist() == [5]
     directions = directions_of(TRUTH)
+    directions = replace(directions, parallax_deg=np.full(len(directions.pairs), 60.0))  # no turn is as large
     for turned in ([], [3]):
         judged = doubt_cameras(placement, directions, relative_rotations(TRUTH, turned), TRUTH)
         kinds = judged.assessment.doubts.kinds

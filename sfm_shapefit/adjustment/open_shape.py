@@ -1,0 +1,100 @@
+"""How far a model goes at equal fit once what was held at no measurement is free.
+
+Lenses of a model that nobody calibrated were found with its shape, and so were its rotations, if its own
+tracks are all there is. Few views, forward motion, or a yaw on the spot leave focal length, distortion and
+shape free together: a model that fits its points is one of many. What the points leave open of each center
+is the sum of two parts, with lenses pulled by what unmeasured ones may be off, a factor of two:
+
+    covariance    by noise, what it grows by when the lenses are free, at the points where the model stands
+    drift         |d|^2 / 3 along every axis, d the way to the minimum with all free: one draw of three axes
+
+The first sees valleys along which nothing pulls, the second those at whose other end the model stands. With
+sound models of 7 to 100 images, 97 % of the cameras drift by less than 2 % of the extent, 4 % at most; 10 of
+17 of an undetermined one drift by 5 to 43 %.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.adjustment.covariance import estimate_covariances
+from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
+from sfm_shapefit.adjustment.given_rotations import noise_of
+from sfm_shapefit.adjustment.lens_doubts import excess
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.run import MOST_FRAMES, begin
+from sfm_shapefit.adjustment.solve import reprojection_errors_px
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import INSIDE, distances_in_spreads, fit_similarity_l1
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import PARTS, Lens, Origin
+from sfm_shapefit.tracks.links import ObservedTracks
+from sfm_shapefit.tracks.options import StructureOptions
+
+_FALL = 1e-5  # relative fall of the cost at which the drift ends; valleys are long and flat
+_FOCAL_SIGMA = float(np.log(2.0))  # share; a focal length that only a bent shape holds may be twice too long
+
+
+class LeftOpen(NamedTuple):
+    """What is left open of centers, covariances (i, 3, 3) in squared units of the images."""
+
+    more: FloatArray
+    """Beside what noise does where lenses are known."""
+    every: FloatArray
+    """With what noise does."""
+
+
+def estimate_open_shape(
+    images: Images, tracks: ObservedTracks, *, lenses_held: bool = False, rotations_held: bool = False
+) -> LeftOpen | None:
+    """Return what a model's own tracks leave open of its centers.
+
+    None where it is not known: too many frames, or points that leave more open than a similarity.
+
+    Args:
+        images: all posed, where the model has them.
+        tracks: of its points.
+        lenses_held, rotations_held: whether these are known from elsewhere.
+    """
+    doubted = [_unmeasured(lens) if lens.is_adjustable else lens for lens in images.lenses]
+    parts = np.array([[lens.is_adjustable and not lenses_held] * len(PARTS) for lens in images.lenses])
+    freedom = Freedom(parts=parts, pull_rad=0.0 if rotations_held else np.inf)
+    images = images.with_lenses(doubted)
+    if len(images.frames.ids) > MOST_FRAMES:
+        return None
+    try:
+        run = begin(images, tracks, StructureOptions(), freedom, GivenPoses())
+        _, _, problem = run.problem_of_all(checked=True)
+        run = replace(run, freedom=replace(run.freedom, noise_px=_noise_px(problem)))
+        after, _ = run.solve(problem, _FALL)
+        options = after.options_at_optimum()
+        free = estimate_covariances(freedom.apply(problem, None), options, **freedom.overrides())
+        held = estimate_covariances(problem, options, deciding=free.deciding)
+        drift = _drift(images, after.images)
+    except UnsolvableError:
+        return None
+    more = excess(free.centers, held.centers) + drift
+    every = np.nan_to_num(free.centers) + drift
+    return LeftOpen(more[images.frame_of], every[images.frame_of])
+
+
+def _unmeasured(lens: Lens) -> Lens:
+    """Return a lens that may be off by what nothing measured is off by."""
+    doubted = lens.in_doubt(Origin.GUESS)
+    return replace(doubted, sigmas=(_FOCAL_SIGMA, *doubted.sigmas[1:]))
+
+
+def _drift(before: Images, after: Images) -> FloatArray:
+    """Return |d|^2 / 3 along the axes (f, 3, 3) for how far frames have moved, but for a similarity."""
+    own, moved = before.frames.centers, after.frames.centers
+    inside = distances_in_spreads(own, own) <= INSIDE
+    apart = fit_similarity_l1(moved[inside], own[inside]).apply(moved) - own
+    return np.asarray(np.sum(apart**2, axis=1)[:, None, None] / 3.0 * np.eye(3))
+
+
+def _noise_px(problem: AdjustmentProblem) -> float:
+    """Return the standard deviation of an observation per axis, by the median error."""
+    unknowns = 3 * problem.num_points + 6 * problem.num_frames
+    return noise_of(float(np.nanmedian(reprojection_errors_px(problem))), unknowns, problem.num_observations)
