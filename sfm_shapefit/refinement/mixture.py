@@ -51,11 +51,13 @@ from sfm_shapefit.solver.program import adjoint, differences
 _LEVELS_RAD = np.geomspace(1e-7, 0.25, 22)
 """Noise levels, radians, two of them a factor of 2 apart; noise below the first is none, beyond the last
 nothing is known of a direction."""
+_LOG_LEVELS = np.log(_LEVELS_RAD)
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
 _NEXT_FLOOR_RAD = 0.01  # radians; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
-_PSEUDO_WRONG, _PSEUDO_LEVEL = 1.0, 0.05  # pairs added to the count of each share; none may become 0
+_SPREADS = (0.35, 1.3)  # standard deviation of log levels, least (half a step of the grid) and largest
+_PSEUDO_WRONG = 1.0  # pairs added to the wrong ones, whose share may not become 0
 _FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
@@ -69,6 +71,8 @@ _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most 
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
 _TYPICAL = 0.8  # share of the right pairs; the level that so many have at most serves a consensus
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
+_WEIGH_ROUNDS = 3  # of share and variances, at locations that stay
+_TINY = float(np.finfo(np.float64).tiny)
 _LARGEST_VARIANCE = 1.0  # rad^2; a direction that nothing determines has no more
 
 
@@ -153,6 +157,27 @@ class Mixture:
             end = found
         return end
 
+    def lead(self, end: MixtureEnd, other: MixtureEnd) -> float:
+        """Return by how many nats the bound of one end is above the other's, at the noise of the noisier."""
+        noisier = max(end, other, key=lambda found: float(found.shares[1:] @ _LOG_LEVELS) / found.right_share)
+        return self._weigh(end, noisier) - self._weigh(other, noisier)
+
+    def _weigh(self, end: MixtureEnd, noisier: MixtureEnd) -> float:
+        """Return the bound at the locations of an end, with the levels of the right directions of another."""
+        if end is noisier:
+            return end.bound
+        at, shares, bound = self._residuals(end.locations), noisier.shares, -np.inf
+        variances = np.zeros_like(self._own)
+        for _ in range(_WEIGH_ROUNDS):
+            wrong = self._expect(at.errors**2 + variances, shares, 0.0)[2][0] / len(self._own)
+            shares = np.r_[wrong, (1.0 - wrong) / noisier.right_share * noisier.shares[1:]]
+            noise = _Noise(shares, 0.0, variances, self._precision(at.lengths))
+            system = self._equations(at, noise)
+            if not self._refactor(system, _DAMPING[1]):
+                return -np.inf
+            bound, variances = self._log_determinant(system, noise) - system.cost, self._propagate(at)
+        return bound
+
     def _descend(self, start: FloatArray, floor: float, shares: FloatArray) -> MixtureEnd | None:
         at, damping, bound, last = self._residuals(start), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
@@ -217,9 +242,7 @@ class Mixture:
     def _fit(self, expected: FloatArray, shares: FloatArray, floor: float) -> FloatArray:
         """Return the shares after some rounds of expectation maximization."""
         for _ in range(_FIT_ROUNDS):
-            sums = self._expect(expected, shares, floor)[2]
-            sums += np.r_[_PSEUDO_WRONG, np.full(len(_LEVELS_RAD), _PSEUDO_LEVEL)]
-            last, shares = shares, sums / sums.sum()
+            last, shares = shares, _share_out(self._expect(expected, shares, floor)[2], floor)
             if np.abs(shares - last).max() <= _SETTLED:
                 break
         return shares
@@ -299,6 +322,18 @@ class Mixture:
         level = _LEVELS_RAD[min(np.searchsorted(right, _TYPICAL * right[-1]), len(_LEVELS_RAD) - 1)]
         odds = np.full(len(self._own), logit(end.right_share))
         return put_by_consensus(self._graph, end.locations, odds, level**2 + self._own.mean(axis=1))
+
+
+def _share_out(sums: FloatArray, floor: float) -> FloatArray:
+    """Return the most likely shares (K + 1,) for sums of the posteriors; none below the floor."""
+    first = max(int(np.searchsorted(_LEVELS_RAD, floor, side="right")) - 1, 0)
+    logs, counts = np.log(np.maximum(_LEVELS_RAD[first:], floor)), sums[first + 1 :] + _TINY
+    mean = float(counts @ logs / counts.sum())
+    spread = np.clip(np.sqrt(counts @ (logs - mean) ** 2 / counts.sum()), *_SPREADS)
+    normal = np.exp(-0.5 * ((logs - mean) / spread) ** 2)
+    right, wrong = float(counts.sum()), float(sums[0]) + _PSEUDO_WRONG
+    shares = np.r_[wrong, np.zeros(first), right / normal.sum() * normal]
+    return np.asarray(shares / (right + wrong))
 
 
 def _excess_logs(lengths: FloatArray) -> FloatArray:
