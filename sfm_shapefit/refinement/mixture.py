@@ -53,7 +53,7 @@ _LEVELS_RAD = np.geomspace(1e-7, 0.25, 22)
 nothing is known of a direction."""
 _LOG_LEVELS = np.log(_LEVELS_RAD)
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
-_NEXT_FLOOR_RAD = 0.01  # radians; after a consensus, which is nearer than a start
+_NEXT_FLOOR = 2.0  # typical levels; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
 _SPREADS = (0.35, 1.3)  # standard deviation of log levels, least (half a step of the grid) and largest
@@ -71,6 +71,7 @@ _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most 
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
 _TYPICAL = 0.8  # share of the right pairs; the level that so many have at most serves a consensus
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
+_MOST_LEVERAGE = 0.999  # share of a residual's variance; nothing but the pair holds such a camera
 _WEIGH_ROUNDS = 3  # of share and variances, at locations that stay
 _TINY = float(np.finfo(np.float64).tiny)
 _LARGEST_VARIANCE = 1.0  # rad^2; a direction that nothing determines has no more
@@ -148,10 +149,11 @@ class Mixture:
     def improve(self, end: MixtureEnd) -> MixtureEnd:
         """Return the end of most evidence that consensus and descents, in turn, lead to."""
         for _ in range(_MOST_ROUNDS):
-            moved = self._put_by_consensus(end)
+            level = self._typical_level(end)
+            moved = self._put_by_consensus(end, level)
             if np.array_equal(moved, end.locations):
                 break
-            found = self._descend(moved, _NEXT_FLOOR_RAD, end.shares)
+            found = self._descend(moved, min(_NEXT_FLOOR * level, _FIRST_FLOOR_RAD), end.shares)
             if found is None or found.bound <= end.bound + _ROUND_GAIN:
                 break
             end = found
@@ -230,13 +232,13 @@ class Mixture:
         return _Residuals(scaled, floored, units, errors * (angles / sines)[:, None])
 
     def _expect(
-        self, expected: FloatArray, shares: FloatArray, floor: float
+        self, expected: FloatArray, shares: FloatArray, floor: float, own: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return information per axis (m, d - 1), log likelihood (m,), sums of the posteriors (K + 1,)."""
         information, likelihood = np.empty_like(expected), np.empty(len(expected))
         sums, weights = np.zeros_like(shares), shares * np.r_[1.0, np.full(len(_LEVELS_RAD), self._peak)]
         levels = np.maximum(_LEVELS_RAD, floor)
-        _expect(expected, self._own, levels**2, weights, (information, likelihood, sums))
+        _expect(expected, self._own if own is None else own, levels**2, weights, (information, likelihood, sums))
         return information, likelihood, sums
 
     def _fit(self, expected: FloatArray, shares: FloatArray, floor: float) -> FloatArray:
@@ -249,10 +251,14 @@ class Mixture:
 
     def _judge(self, at: _Residuals, noise: _Noise, bound: float) -> MixtureEnd:
         """Return locations with the posterior that each direction is right, and its variance if it is."""
-        shares, tiny = noise.shares, np.finfo(float).tiny
+        shares = noise.shares
         information, likelihood, _ = self._expect(at.errors**2 + noise.variances, shares, 0.0)
         right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
-        variances = np.maximum(right, tiny) / np.maximum(information.mean(axis=1), tiny)
+        variances = np.maximum(right, _TINY) / np.maximum(information.mean(axis=1), _TINY)
+        left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)  # of an error, without the pair
+        alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
+        likelihood = self._expect((at.errors / left) ** 2, shares, 0.0, self._own + alone)[1]
+        right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
         return MixtureEnd(
             locations=at.locations,
             bound=bound,
@@ -317,9 +323,11 @@ class Mixture:
         variances = np.sum(across * (relative @ across), axis=1) / at.lengths[:, None] ** 2
         return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
 
-    def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
+    def _typical_level(self, end: MixtureEnd) -> float:
         right = np.cumsum(end.shares[1:])
-        level = _LEVELS_RAD[min(np.searchsorted(right, _TYPICAL * right[-1]), len(_LEVELS_RAD) - 1)]
+        return float(_LEVELS_RAD[min(np.searchsorted(right, _TYPICAL * right[-1]), len(_LEVELS_RAD) - 1)])
+
+    def _put_by_consensus(self, end: MixtureEnd, level: float) -> FloatArray:
         odds = np.full(len(self._own), logit(end.right_share))
         return put_by_consensus(self._graph, end.locations, odds, level**2 + self._own.mean(axis=1))
 
