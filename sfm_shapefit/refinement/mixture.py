@@ -63,6 +63,7 @@ _SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
+_LONGEST = 50.0  # median lengths; e^4, beyond what a spread of lengths of 2 allows for all pairs of a node
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
@@ -181,7 +182,7 @@ class Mixture:
         return bound
 
     def _descend(self, start: FloatArray, floor: float, shares: FloatArray) -> MixtureEnd | None:
-        at, damping, bound, last = self._residuals(start), _DAMPING[0], -np.inf, None
+        at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
         for _ in range(_MOST_STEPS):
             shares = self._fit(at.errors**2 + variances, shares, floor)
@@ -197,6 +198,23 @@ class Mixture:
             variances, at = self._propagate(at), moved  # the variance of a residual hardly moves in a step
             floor = max(floor * _FALL, float(_LEVELS_RAD[0]))
         return None if last is None else self._judge(*last)
+
+    def _draw_in(self, start: FloatArray) -> FloatArray:
+        """Return a start with the nodes all of whose pairs are very long amid their neighbors.
+
+        Nothing determines such a node, and at the scale of the others the prior of lengths hardly moves it.
+        """
+        edges, n = self._graph.edges, self._graph.num_nodes
+        lengths = np.linalg.norm(differences(start, edges), axis=1)
+        least = np.full(n, np.inf)
+        np.minimum.at(least, edges.ravel(), np.repeat(lengths, 2))
+        far = least > _LONGEST * np.median(lengths)
+        near, start = ~far[edges[:, ::-1]], start.copy()
+        sums, counts = np.zeros_like(start), np.bincount(edges[near], minlength=n)
+        np.add.at(sums, edges[near], start[edges[:, ::-1][near]])
+        far &= counts > 0
+        start[far] = sums[far] / counts[far, None]
+        return start
 
     def _step(
         self, at: _Residuals, noise: _Noise, system: _System, damping: float
