@@ -35,7 +35,7 @@ from sfm_shapefit.facts.placed import (
 from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
 from sfm_shapefit.facts.scene import DistanceFacts, Loop, describe_line, describe_loops
 from sfm_shapefit.facts.tables import CameraRow, PairRow
-from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.placement.place import Placement
