@@ -3,7 +3,10 @@
 Do not use, if any of these holds:
 
     the pairs that agree hold less than half of the cameras in one rigid piece, also with the points that fit,
-    however many contradict; of a bare graph, the residuals of its directions have a level above 6 degrees
+    however many contradict
+    of a bare graph, the residuals of its directions have a level above 6 degrees; another placement explains
+    the pairs nearly as well, or triangles speak for most of the pairs that it rejects
+    (`placement.second_configuration`); or more than a third of the cameras is uncertain
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than half of all images are in the output
@@ -15,7 +18,7 @@ Do not use, if any of these holds:
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
 placed but are not in the output, that are kept though their matches make no points, that many pairs
 contradict and no pixels confirm (`witnesses`), or that evidence which the fit did not use names: another
-place, a seam, a wrong lens. Trust is not low where the pixels confirm a camera. Look also, though no camera
+place, a seam, a wrong lens; in a bare graph also those that few pairs tie to the rest (`few_ties`). Trust is not low where the pixels confirm a camera. Look also, though no camera
 can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade
@@ -45,6 +48,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import distances_in_spreads
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.few_ties import barely_held, find_few_ties
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import (
     FEW,
@@ -152,10 +156,35 @@ def judge_graph(placement: Judged) -> ModelVerdict:
     if level > MOST_LEVEL_DEG:
         clause = f"the directions are {level:.0f} degrees off the cameras"
         reasons.append(Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE))
+    count, uncertain = len(placement.cameras), len(uncertain_cameras(placement))
+    if uncertain > MANY * count:
+        clause = f"{uncertain} of {counted(count, 'camera')} are uncertain by more than {RARE:.0%} of the extent"
+        reasons.append(Reason(kind=Kind.UNCERTAIN, sentence=clause, grade=Grade.DO_NOT_USE))
     if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
         clause = "no pair is checked by others"
         reasons.append(Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED))
-    return judge_model(placement, Shares(), reasons)
+    return judge_model(placement, Shares(), reasons, _few_ties(placement))
+
+
+def _few_ties(placement: Judged) -> Iterator[Reason]:
+    """Yield which cameras of a graph few agreeing pairs tie to the rest, and how well these are known."""
+    graph, agrees = placement.measured_part().graph, placement.agreement.agrees
+    edges, count = graph.edges[agrees], graph.num_nodes
+    shares = largest_sigmas(placement) / _extent(placement.locations)
+    for few in find_few_ties(count, edges):
+        some = counted(few.num_pairs, "agreeing pair")
+        clause = f"{some} only tie {len(few.cameras)} cameras to the rest, {_known_to(shares[few.cameras])}"
+        names = tuple(map(graph.name_of, few.cameras.tolist()))
+        yield Reason(kind=Kind.UNCHECKED, sentence=clause, images=names)
+    for k in np.flatnonzero(barely_held(count, edges, graph.directions[agrees])).tolist():
+        clause = f"fewer than three of its agreeing pairs differ in direction; it is {_known_to(shares[[k]])}"
+        yield from of_each(Kind.UNCHECKED, [graph.name_of(k)], clause)
+
+
+def _known_to(shares: FloatArray) -> str:
+    """Say how uncertain cameras of some standard deviations are, which are shares of the extent."""
+    largest = float(shares.max())
+    return f"known to ± {100.0 * largest:.2g} % of the extent" if largest < 1.0 else "not determined"
 
 
 def judge_model(
@@ -201,9 +230,10 @@ def _doubtful_cameras(placement: Judged) -> Iterator[Reason]:
 
 def _reasons_to_look(placement: Judged, shares: Shares) -> Iterator[Reason]:
     """Yield why a model is to be looked at as a whole."""
-    if placement.second_configuration is not None:
-        clause = "many rejected pairs agree on a second configuration"
-        yield Reason(kind=Kind.REPEATED, sentence=clause)
+    second = placement.second_configuration
+    if second is not None:
+        grade = Grade.DO_NOT_USE if second.is_as_good else Grade.LOOK
+        yield Reason(kind=Kind.REPEATED, sentence=second.clause, grade=grade)
     if shares.placed < FEW_PLACED:
         yield Reason(kind=Kind.LEFT_OUT, sentence=f"only {shares.placed:.0%} of the images are placed")
     elif shares.here < FEW_PLACED:
