@@ -160,6 +160,7 @@ def _facts(names):
         not_trusted={},
         few_points={},
         pairs={"usable": 102, "outlier": 18},
+        num_contradicting=0,
         agreement=EvidenceShares(pairs=0.8, observations=None, contradicting=None),
         num_points=500,
         mean_reprojection_error_px=0.62,

@@ -46,7 +46,7 @@ CHANGES = {
             "pipeline/known.py",
         },
     ),
-    "a warning": Change(1, r"lengths are poorly known", {"facts/warnings.py"}),
+    "a warning": Change(1, r"two ways to find lengths disagree", {"facts/warnings.py"}),
     "a GPU solver": Change(
         2,
         r"\bLiteral\b.*\"conic\"|\bsolve_conic\(graph, tol, limit\)",

@@ -37,6 +37,10 @@ class NextStep(NamedTuple):
     text: str
     command: str
 
+    def at(self, folder: str) -> "NextStep":
+        """Return the step for a model in a folder, which is quoted."""
+        return self._replace(command=self.command.format(out=folder, out_dense="dense"))
+
 
 class Telling(NamedTuple):
     """What is told of a result in a terminal."""

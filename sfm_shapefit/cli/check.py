@@ -1,8 +1,11 @@
 """`sfm-shapefit check MODEL`."""
 
 import shlex
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -28,6 +31,9 @@ from sfm_shapefit.cli.flags import (
 )
 from sfm_shapefit.cli.root import app
 
+if TYPE_CHECKING:
+    from sfm_shapefit.pipeline.checked import CheckResult
+
 
 @app.command(
     "check",
@@ -45,14 +51,18 @@ def check_command(
         typer.Option("--report", metavar="FILE", help="Write a page that explains the verdict to FILE."),
     ] = None,
     images: ImageFolder = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE, and OUT.")] = False,
     second_opinion: Annotated[
-        bool,
+        Path | None,
         typer.Option(
-            "--second-opinion/--no-second-opinion",
-            help="Also make a model of the database with `map`, and compare the two.",
+            "--second-opinion",
+            metavar="OUT",
+            help="Keep the models that `map` makes of the database, which MODEL is compared with, in OUT.",
         ),
-    ] = True,
+    ] = None,
+    no_second_opinion: Annotated[
+        bool, typer.Option("--no-second-opinion", help="Make none of the database, and compare with none.")
+    ] = False,
     as_json: Json = False,
     strict: Annotated[bool, typer.Option("--strict", help=f"{STRICT_HELP}.")] = False,
     quiet: Quiet = False,
@@ -73,17 +83,25 @@ def check_command(
         from sfm_shapefit.pipeline.check import check
         from sfm_shapefit.pipeline.write import refuse_file
 
+        if second_opinion is not None and no_second_opinion:
+            raise InputError("--second-opinion and --no-second-opinion contradict each other; give one")
+        near = database or find_database(source)
+        if second_opinion is not None and near is None:
+            raise InputError("a second opinion needs the database of MODEL; name it with --database")
+        inputs = [path for path in (source, near, images) if path is not None]
         if images is not None and report is None:
             raise InputError("pictures of the images go into a page; name it with --report")
         if report is not None:  # now, not when all is computed
             if report.exists() and not overwrite:
                 read_source(source, database)  # what is wrong with that is said first
-            inputs = [
-                path for path in (source, database or find_database(source), images) if path is not None
-            ]
             refuse_file(report, overwrite=overwrite, protect=inputs)
-        with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
-            found = check(source, database, second_opinion=second_opinion, progress=progress)
+        with (
+            _claimed(second_opinion, overwrite=overwrite, protect=inputs),
+            show_progress(not (quiet or as_json)) as progress,
+            hear_pycolmap(False),
+        ):
+            found = check(source, database, second_opinion=not no_second_opinion, progress=progress)
+            found = _keep_second(found, second_opinion, overwrite=overwrite)
         if report is not None:
             found.report(report, images=images or "", overwrite=overwrite)
         if as_json:
@@ -95,3 +113,21 @@ def check_command(
             print_ending(found.verdict.grade.value, found.verdict.statement, written, told.step.command)
         if strict and not found.verdict.is_usable:
             raise typer.Exit(EXIT_UNSOLVABLE)
+
+
+def _claimed(out: Path | None, *, overwrite: bool, protect: Sequence[Path]) -> AbstractContextManager[None]:
+    """Return what holds the place of an output folder, if one is wanted."""
+    from sfm_shapefit.base.atomic_folder import claimed_output
+
+    return nullcontext() if out is None else claimed_output(out, overwrite=overwrite, protect=protect)
+
+
+def _keep_second(found: "CheckResult", out: Path | None, *, overwrite: bool) -> "CheckResult":
+    """Write the models of the second opinion into a folder, if one is wanted, and return what tells of it."""
+    if out is None:
+        return found
+    if found.second_opinion is None:
+        note = f"{out} was not written: no model could be made of the database"
+        return replace(found, facts=replace(found.facts, warnings=[*found.facts.warnings, note]))
+    found.second_opinion.write(out, overwrite=overwrite)
+    return replace(found, facts=replace(found.facts, second_opinion=str(out)))

@@ -8,6 +8,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
@@ -125,6 +126,13 @@ class ToldOpinion(Record):
     has_nothing_in_common: Annotated[
         bool, "Whether the two have different shapes, and nothing says whose is right."
     ]
+    grade: Annotated[Grade, "What the other model is worth by itself."] = Grade.LOOK
+    folder: Annotated[str, "Where it stands among the models that map makes of the database."] = "0"
+
+    @property
+    def is_alike(self) -> bool:
+        """Whether all its cameras stand where the model has them."""
+        return not (self.wrong or self.undecided or self.has_nothing_in_common)
 
     @property
     def statement(self) -> str:

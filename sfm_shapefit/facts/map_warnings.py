@@ -7,6 +7,7 @@ import numpy as np
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
 from sfm_shapefit.facts.scene import describe_repeated_pairs, describe_rival_pairs
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.placement.options import KnownDistance
 
 _ALARMING_SHARE = 0.7  # share of a model's agreeing pairs; below, warn (castle-P30: 0.97, lego100: 0.89)
@@ -26,17 +27,15 @@ def map_warnings(
         )
     for number, model in enumerate(models):
         share, agreements = model.averaging.share, model.averaging.agreements
-        if share < _ALARMING_SHARE:
-            yield (
-                f"model {number}: only {share:.0%} of the pairs agree with the averaged rotations; do not "
-                "trust it without a look"
-            )
+        is_good = model.located.verdict.grade is Grade.GOOD  # whatever its rotations were at first
+        if share < _ALARMING_SHARE and not is_good:
+            yield f"model {number}: only {share:.0%} of the pairs agree with the averaged rotations"
         if model.averaging.num_repeated:
             yield f"model {number}: {describe_repeated_pairs(model.averaging.num_repeated)}"
         if model.averaging.num_rivals:
             yield f"model {number}: {describe_rival_pairs(model.averaging.num_rivals)}"
         doubtful = np.flatnonzero(agreements < _DOUBTFUL_SHARE)
-        if len(doubtful):
+        if len(doubtful) and not is_good:
             worst = model.names[int(doubtful[np.argmin(agreements[doubtful])])]
             yield (
                 f"model {number}: most pairs of {counted(len(doubtful), 'image')} contradict their averaged "

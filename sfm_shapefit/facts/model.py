@@ -16,9 +16,9 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted, rounded
+from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
-from sfm_shapefit.facts.evidence import ToldEvidence
+from sfm_shapefit.facts.evidence import ToldEvidence, ToldOpinion
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics, describe_intrinsics
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.placed import (
@@ -35,8 +35,7 @@ from sfm_shapefit.facts.placed import (
 from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
 from sfm_shapefit.facts.scene import DistanceFacts, Loop, describe_line, describe_loops
 from sfm_shapefit.facts.tables import CameraRow, PairRow
-from sfm_shapefit.judgement.reasons import Grade
-from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.placement.place import Placement
 
@@ -246,6 +245,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         dict[str, int],
         "Pairs by what became of them: usable, outlier, too_few_matches, few_inliers, no_parallax ...",
     ]
+    num_contradicting: Annotated[int, "Usable pairs that are set aside, and off by a degree or more."]
     agreement: Annotated[EvidenceShares, "What share of the evidence agrees."]
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
     scale_sigma: Annotated[
@@ -332,7 +332,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         turned = self.rotation_refinement
         is_given = turned is not None and self.inputs.model != IN_MEMORY
         rotations = turned.statement if turned and is_given else ""
-        lines = self.told_lines((self.pairs["outlier"], self.pairs["usable"]), rotations)
+        lines = self.told_lines((self.num_contradicting, self.pairs["usable"]), rotations)
         return Telling(lines, rows, details, step=self.next_step)
 
     def _pair_lines(self) -> list[str]:
@@ -372,37 +372,67 @@ class CheckedFacts(FactsOfModel):
     median_track_length: Annotated[
         float | None, "Median number of images that see a 3D point; null if there are none."
     ]
+    num_lenses: Annotated[int, "Cameras in COLMAP's sense: lenses of the images with a pose."]
+    second_opinion: Annotated[str | None, "Folder that has the models of the second opinion, if any."] = None
 
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
-        path, second = shlex.quote(self.inputs.path), self.evidence.second
-        is_as_map_has_it = second is not None and not (
-            second.wrong or second.undecided or second.has_nothing_in_common
-        )
-        is_sound = self.verdict.grade is Grade.GOOD or (self.verdict.grade is Grade.LOOK and is_as_map_has_it)
+        path, second, verdict = shlex.quote(self.inputs.path), self.evidence.second, self.verdict
+        is_alike = second is not None and second.is_alike
+        is_sound = verdict.grade is Grade.GOOD or (verdict.grade is Grade.LOOK and is_alike)
         if is_sound and self.num_points:  # poses alone, as of a list, are to be placed with points
-            step = next_of_model(self.verdict.grade, self)
-            return step._replace(command=step.command.format(out=path, out_dense="dense"))
-        if second is not None and second.wrong:
-            command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
-            return NextStep("Next: take the model that map makes of the database; pairs support it.", command)
-        if not (self.inputs.database and self.num_pairs) or self.verdict.doubts_database:
+            return next_of_model(verdict.grade, self).at(path)
+        if (
+            second is not None
+            and not is_alike
+            and (second.wrong or second.grade.is_better_than(verdict.grade))
+        ):
+            return self._next_of_map(second)
+        if any(one.kind is Kind.LENS for one in verdict.findings) and not self.evidence.lenses:
+            return self._next_of_lenses(path)
+        if verdict.grade is Grade.CANNOT_BE_JUDGED or not (self.inputs.database and self.num_pairs):
+            text = (
+                "Next: check it against its photographs, or the database that it was made from (--database)."
+            )
+            return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")
+        if verdict.doubts_database:
             text = "Next: check it against the database that it was made from."
             return NextStep(text, f"sfm-shapefit check {path} --database ITS_DATABASE")
         text = "Next: place the cameras anew from their rotations and matches, and compare."
         return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
 
+    def _next_of_map(self, second: ToldOpinion) -> NextStep:
+        """Return how to take the model that `map` makes of the database: the one that was kept, or anew."""
+        why = "; pairs support it" if second.wrong else ""
+        if self.second_opinion:
+            kept = shlex.quote(f"{self.second_opinion}/{second.folder}")
+            step = next_of_model(second.grade, self).at(kept)
+            return step._replace(text=f"Next: take the model that map made of the database{why}.")
+        command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
+        return NextStep(f"Next: take the model that map makes of the database{why}.", command)
+
+    def _next_of_lenses(self, path: str) -> NextStep:
+        """Return what to do about lenses that cannot be: one per device is known better."""
+        if self.num_lenses == 1:
+            text = "Next: calibrate the lens, or let it change where the cameras are placed anew."
+            command = f"sfm-shapefit locate {path} located --intrinsics all{self.inputs.database_flag}"
+            return NextStep(text, command)
+        text = "Next: give all images of a device one lens, and reconstruct them again."
+        one = "--ImageReader.single_camera 1"
+        return NextStep(text, f"colmap feature_extractor --database_path new.db --image_path IMAGES {one}")
+
     def told(self, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Telling:
         """Return what the terminal says, of cameras what is weak about them."""
         # One that the second opinion confirms is not told, whatever its weakness.
-        doubted = (row for row in cameras if not row.placed or row.name in self.verdict.cameras)
+        doubted = (row for row in cameras if row.placed and row.name in self.verdict.cameras)
         weak = [f"{row.name}: {row.reason}" for row in doubted if row.reason]
-        judged = [pair.verdict for pair in pairs if pair.direction]  # the others say nothing of positions
-        lines = self.told_lines((judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
+        absent = first_of([row.name for row in cameras if not row.placed])
+        judged = [pair for pair in pairs if pair.direction]  # the others say nothing of positions
+        lines = self.told_lines((sum(pair.contradicts for pair in judged), len(judged)))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
         notes = Row("warning", [one for one in self.warnings if one not in self.evidence.statements])
-        rows = [Row("weak", weak), second, notes]
+        rows = [Row("weak", weak), row("without a pose", absent), second, notes]
         return Telling(lines, rows, elsewhere="see the report", step=self.next_step)
 
 

@@ -41,15 +41,15 @@ from sfm_shapefit.facts.placed import (
     TakenForRight,
     facts_of_placement,
 )
+from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.scene import Loop, told_distances
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
-from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
+from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import (
     Shares,
-    judge_graph,
     judge_model,
     too_few_to_judge,
     weigh_evidence,
@@ -74,6 +74,7 @@ from sfm_shapefit.solver.options import SolverResult
 if TYPE_CHECKING:
     import pycolmap
 
+NO_POINTS = "no 3D point could be triangulated"
 NO_SUPPORT = "hardly any of its matches makes a point with a third image: its pose is wrong"
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 CARRIED_FIXED = "fixed; no pair of it takes part"
@@ -255,6 +256,7 @@ class LocateResult(_Placed):
             few_points={self.images.names[camera]: count for camera, count in self.few_points.items()},
             pairs={status.name.lower(): count for status, count in self.directions.counts().items()}
             | {"outlier": len(placement.rejected_pairs)},
+            num_contradicting=placement.num_contradicting,
             agreement=EvidenceShares(
                 pairs=self.agreeing_pairs,
                 observations=self.observations.agreeing,
@@ -315,7 +317,8 @@ class LocateResult(_Placed):
         )
         repeats = tuple(match_warnings(self.directions))[:1]
         repeated = (Reason(kind=Kind.REPEATED, sentence=sentence) for sentence in repeats)
-        after = (*repeated, *self._off_priors(), *self.suspicions)
+        lacks = () if self.model.num_points3D() else (Reason(kind=Kind.POINTS, sentence=NO_POINTS),)
+        after = (*repeated, *self._off_priors(), *lacks, *self.suspicions)
         return judge_model(self.placement, shares, before, after).led_by(self.recognized)
 
     def _off_priors(self) -> Iterator[Reason]:
@@ -476,13 +479,16 @@ def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
 class GraphResult(_Placed):
     """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
 
-    _PUBLIC = ("cameras", "pairs", "table", "options", "timings_s", "placement", "further", "certified")
+    _PUBLIC = (
+        *("cameras", "pairs", "table", "warnings", "options", "timings_s"),
+        *("placement", "further", "certified"),
+    )
     path: Path
     """The graph's file or folder."""
     statement: str
     """What it is, and where rotations came from, for the user."""
     options: PlacementOptions
-    placement: Judged
+    placement: PlacedGraph
     further: tuple[Judged, ...]
     """The further rigid pieces of three nodes or more, each with a scale of its own."""
     timings_s: dict[str, float]
@@ -498,7 +504,7 @@ class GraphResult(_Placed):
             **facts_of_placement(placement, self.cameras, solved, (math.nan, SOLVER_UNITS)),
             options=flat_values(self.options),
             delivered=Delivered.compare(placement, placement.locations, adjusted=False),
-            warnings=list(graph_warnings(placement)),
+            warnings=list(self.warnings),
             inputs=GraphInputs(graph=str(self.path), directions=self.statement),
             dimension=placement.graph.dimension,
             right_pairs=TakenForRight(
@@ -524,10 +530,15 @@ class GraphResult(_Placed):
         """None: nodes have no images."""
         return ()
 
-    @cached_property
+    @property
     def verdict(self) -> ModelVerdict:
         """Whether the model can be used, and why."""
-        return judge_graph(self.placement)
+        return self.placement.verdict
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to know and to do, a sentence each."""
+        return self.placement.warnings
 
     @cached_property
     def cameras(self) -> list[CameraRow]:

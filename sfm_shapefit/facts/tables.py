@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import text_of
+from sfm_shapefit.judgement.limits import KNOWN_DEG
 from sfm_shapefit.judgement.verdicts import Verdict
 
 TableName = Literal["cameras", "pairs"]
@@ -94,6 +95,11 @@ class PairRow:
     """Angle between the direction and the baseline of the position priors, where both cameras have one."""
     posterior: float = math.nan
     """Probability that the direction is right, by its residual and by the residuals of all pairs."""
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether it says that its cameras stand elsewhere; by less than a degree it does not."""
+        return self.verdict == Verdict.OUTLIER.value and not self.residual_deg < KNOWN_DEG
 
 
 _ROW_TYPES: dict[TableName, type[CameraRow] | type[PairRow]] = {"cameras": CameraRow, "pairs": PairRow}

@@ -1,4 +1,8 @@
-"""What the user should know beyond the tables, a sentence each."""
+"""What the user should know beyond the tables, a sentence each.
+
+A warning states what is so. What that means for the use of a model the verdict alone says: a warning that
+doubts cameras has a reason in it, by the same rule, and the others stand beside any grade.
+"""
 
 from collections.abc import Iterator, Sequence
 
@@ -6,13 +10,14 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.wording import counted_are, first_of
-from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, largest_sigmas, uncertain_cameras
+from sfm_shapefit.judgement.grade import largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import RARE
 from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Kind, Reason
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_fit import PriorFit
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.options import Status
 
 _ALARMING_SHARE = 0.5  # share of pairs against the solution, or the given rotations; above, warn
@@ -55,27 +60,35 @@ def rotation_suspicions(turned_deg: FloatArray, sigma_deg: float) -> Iterator[Re
         yield Reason(kind=Kind.INPUT, sentence=clause)
 
 
-def quality_warnings(placement: Judged) -> Iterator[str]:
-    """Yield what the user should know about a solution, a sentence each."""
+def quality_warnings(placement: Judged, options: PlacementOptions | None = None) -> Iterator[str]:
+    """Yield what the user should know about a solution, found with some options, a sentence each."""
     if placement.certified.status is not Status.CONVERGED:
         yield f"the solve is not certified to the tolerance: {placement.certified.status.value}"
     if placement.certified.unique is False:
-        yield "other placements may fit as well: the certificate does not prove the optimum unique"
+        yield "the certificate does not prove the optimum of the convex program unique"
     refined, rejected = placement.refined, len(placement.rejected_pairs) / max(len(placement.pairs), 1)
+    contradicting = placement.num_contradicting / max(len(placement.pairs), 1)
     adjusted = placement.adjusted_covariances  # pixels tell lengths, whatever the starts had
     is_measured = adjusted is not None and not np.isnan(adjusted).any()
     if refined.collapsed and not (is_measured or (refined.is_refined and rejected <= _FEW_REJECTED)):
         assert refined.disagreement is not None
         yield (
-            f"lengths are poorly known: two ways to find them disagree by {refined.disagreement:.0%}, as on "
-            "long chains and with many wrong pairs"
-            + ("" if refined.is_refined else "; objective=auto refines both and compares")
+            f"two ways to find lengths disagree by {refined.disagreement:.0%}, as on long chains and with "
+            "many wrong pairs" + ("" if refined.is_refined else _how_to_refine(options))
         )
     yield from _uncertainty_warnings(placement)
-    if rejected > _ALARMING_SHARE:
-        yield f"{rejected:.0%} of the pairs contradict the solution; do not trust it without a look"
+    if contradicting > _ALARMING_SHARE:
+        yield f"{contradicting:.0%} of the pairs contradict the solution and are set aside"
     if placement.second_configuration is not None:
         yield placement.second_configuration.statement()
+
+
+def _how_to_refine(options: PlacementOptions | None) -> str:
+    """Say which option refines the starts of an unrefined answer; nothing if none in force prevents it."""
+    if options is None or options.refines:
+        return ""
+    other = "refine=True" if not options.refine else f"objective={PlacementOptions().objective}"
+    return f"; {other} refines both and compares"
 
 
 def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
@@ -148,12 +161,9 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
         )
 
 
-def graph_warnings(placement: Judged) -> Iterator[str]:
+def graph_warnings(placement: Judged, options: PlacementOptions | None = None) -> Iterator[str]:
     """Yield what the user should know about a bare graph, all of whose placed nodes are in the answer."""
-    yield from quality_warnings(placement)
-    level = placement.assessment.level_deg
-    if level > MOST_LEVEL_DEG:
-        yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
+    yield from quality_warnings(placement, options)
     floor = TrustOptions().min_trust
     low = np.flatnonzero(placement.assessment.trust < floor)
     if len(low):

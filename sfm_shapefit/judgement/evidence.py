@@ -18,6 +18,7 @@ from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, norm
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, OUTNUMBERED, SIGMAS, SURE_SIGMAS
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
@@ -144,6 +145,10 @@ class SecondOpinion(NamedTuple):
     """Pairs of these that support the other."""
     ambiguous: IntArray
     """Rows of cameras that stand where they do in the other model, which doubts them; none is `confirmed`."""
+    grade: Grade = Grade.LOOK
+    """What the other model is worth by itself."""
+    folder: str = "0"
+    """Where it stands among the models of the same database."""
 
     @property
     def alike(self) -> IntArray:
@@ -182,14 +187,16 @@ class ModelEvidence:
     def beside(self, second: SecondOpinion, contradicting: IntArray) -> "ModelEvidence":
         """Return the same with a second opinion, without what that clears; `contradicting` is (b, 2) pairs.
 
-        A group most of which is alike in both is right if most pairs that contradict it are with wrong ones.
+        A group most of which is alike in both is right if the other model is good, or if most pairs that
+        contradict it are of cameras that stand elsewhere, in it or not; these are named by themselves.
         """
+        elsewhere = np.concatenate([second.wrong, second.undecided])
 
         def may_be_wrong(group: Seam | Untied) -> bool:
-            inside = np.isin(contradicting, group.cameras)
-            across = inside.sum(axis=1) == 1
-            by_wrong = (np.isin(contradicting, second.wrong) & ~inside)[across].any(axis=1)
-            return not (second.has_most_alike(group.cameras) and by_wrong.sum() > HALF * across.sum())
+            across = np.isin(contradicting, group.cameras).sum(axis=1) == 1
+            of_these = np.isin(contradicting[across], elsewhere).any(axis=1)
+            is_cleared = second.grade is Grade.GOOD or of_these.sum() > HALF * across.sum()
+            return not (second.has_most_alike(group.cameras) and is_cleared)
 
         confirmed = set(second.confirmed.tolist())
         return replace(

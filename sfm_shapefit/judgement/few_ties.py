@@ -39,7 +39,7 @@ def barely_held(num_nodes: int, edges: IntArray, directions: FloatArray) -> Bool
         told = outward[first][np.searchsorted(nodes, ends)]
         differs = np.einsum("ed,ed->e", outward, told) < alike
         ends, outward = ends[differs], outward[differs]
-    return np.bincount(ends, minlength=num_nodes) == 0
+    return np.asarray(np.bincount(ends, minlength=num_nodes) == 0)
 
 
 def find_few_ties(num_nodes: int, edges: IntArray) -> list[FewTies]:

@@ -132,8 +132,9 @@ def _find_apart(evidence: ModelEvidence) -> tuple[list[int], str]:
     """Return the cameras that stand apart, and a clause on how many ({}) do."""
     loose, second = [group.cameras for group in evidence.untied if group.is_loose], evidence.second
     groups = [*(seam.cameras for seam in evidence.seams), *loose]
-    if second is not None and len(second.wrong) > 1:  # which tells where the seam of these runs
+    if second is not None and len(second.wrong) + len(second.undecided) > 1:  # which tell where seams run
         groups = [g if second.has_most_alike(g) else np.setdiff1d(g, second.alike) for g in groups]
+    if second is not None and len(second.wrong) > 1:
         groups.insert(0, second.wrong)
     clause = (
         "nothing says how {} stand to the rest"
@@ -158,7 +159,9 @@ def judge_graph(placement: Judged) -> ModelVerdict:
         reasons.append(Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE))
     count, uncertain = len(placement.cameras), len(uncertain_cameras(placement))
     if uncertain > MANY * count:
-        clause = f"{uncertain} of {counted(count, 'camera')} are uncertain by more than {RARE:.0%} of the extent"
+        clause = (
+            f"{uncertain} of {counted(count, 'camera')} are uncertain by more than {RARE:.0%} of the extent"
+        )
         reasons.append(Reason(kind=Kind.UNCERTAIN, sentence=clause, grade=Grade.DO_NOT_USE))
     if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
         clause = "no pair is checked by others"

@@ -6,6 +6,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
 from sfm_shapefit.base.blas_threads import one_blas_thread
+from sfm_shapefit.judgement.limits import KNOWN_DEG
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.second_configuration import (
@@ -43,6 +44,12 @@ class Judged(Placement):
         return replace(
             self, assessment=replace(self.assessment, covariances=own), adjusted_covariances=adjusted
         )
+
+    @property
+    def num_contradicting(self) -> int:
+        """Number of rejected pairs that are off by a degree or more; others are off by little, if surely."""
+        rejected = self.pairs[~self.agreement.agrees[self.pairs]]
+        return int(np.sum(~(self.assessment.residuals_deg[rejected] < KNOWN_DEG)))
 
     @property
     def covariances(self) -> FloatArray:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Annotated, Self
 
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.base.wording import counted, counted_are, first_of
 
 IS_ITS_DATABASE = "is this the model's database?"  # ends a sentence that doubts the matches, not the model
 
@@ -18,6 +18,10 @@ class Grade(enum.StrEnum):
     LOOK = "look"
     CANNOT_BE_JUDGED = "cannot be judged"
     DO_NOT_USE = "do not use"
+
+    def is_better_than(self, other: "Grade") -> bool:
+        """Return whether a model of this grade is worth more than one of another."""
+        return list(Grade).index(self) < list(Grade).index(other)
 
 
 class Kind(enum.StrEnum):
@@ -111,10 +115,15 @@ class ModelVerdict(Record):
     def _sentence(self) -> str:
         if self.grade is Grade.GOOD:
             return "good"
-        if self.grade is Grade.LOOK and self.cameras:
-            what = f"look at {counted(len(self.cameras), 'camera')} ({first_of(self.cameras)})"
-            return "; ".join([what, *self.reasons])
-        return f"{self.grade.value}: {'; '.join(self.reasons)}"
+        if self.grade is not Grade.LOOK:
+            return f"{self.grade.value}: {'; '.join(self.reasons)}"
+        findings = (one for one in self.findings if one.kind is Kind.LEFT_OUT)
+        left_out = [name for one in findings for name in one.images]
+        there = [name for name in self.cameras if name not in left_out]
+        what = f"look at {counted(len(there), 'camera')} ({first_of(there)})" if there else ""
+        gone = f"{counted_are(len(left_out), 'image')} left out ({first_of(left_out)})" if left_out else ""
+        said = "; ".join(filter(None, [what, gone, *self.reasons]))
+        return said if there else f"{self.grade.value}: {said}"
 
 
 def of_each(kind: Kind, images: Sequence[str], sentence: str) -> tuple[Reason, ...]:

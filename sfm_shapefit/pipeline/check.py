@@ -36,7 +36,8 @@ def check(
         database: as for `locate`; without one, the pairs are those that share points of the model, which
             agree with it more easily.
         second_opinion: whether `map_database` places the images of the database anew, to compare with; or
-            what it made of that database already. Without a database there is none.
+            what it made of that database already. The result has it under the same name; None without a
+            database.
         progress: called as stages advance.
 
     Raises:
@@ -70,11 +71,13 @@ def _map_anew(
         except UnsolvableError:
             return None
     models = [model.located for model in found.models]
-    best = max(models, key=lambda one: _num_common(posed.images, one.placed))
+    number = max(range(len(models)), key=lambda k: _num_common(posed.images, models[k].placed))
+    best = models[number]
     doubted = np.zeros(best.placed.num_images, dtype=np.bool_)
     doubted[best.placement.cameras] = best.placement.assessment.ambiguous
     doubted[[place.camera for place in best.evidence.places]] = True
-    return best.placed, fit_pairs(best.placed.centers, best.directions), doubted
+    fits = fit_pairs(best.placed.centers, best.directions)
+    return OtherModel(best.placed, fits, doubted, found, number)
 
 
 def _num_common(images: Images, others: Images) -> int:

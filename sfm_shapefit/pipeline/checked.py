@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.evidence import tell_evidence
+from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
@@ -71,6 +72,8 @@ class CheckResult(Reported, Tabled):
     quality: ImageQuality
     facts: CheckedFacts
     """The figures, as `check --json` prints them."""
+    second_opinion: MapResult | None = None
+    """What `map_database` made of the same database, to compare with."""
 
     @property
     def reconstruction(self) -> "pycolmap.Reconstruction":
@@ -93,9 +96,19 @@ class CheckResult(Reported, Tabled):
         return f"{self.facts.num_placed} of {self.facts.num_images} images, {self.verdict.statement}"
 
 
-OtherModel = tuple[Images, PairFits, BoolArray]
-"""Another model of the same matches, to compare with: where it has the images, how pairs fit it, and which
-images (n,) may stand elsewhere by their own matches."""
+class OtherModel(NamedTuple):
+    """Another model of the same matches, to compare with."""
+
+    images: Images
+    """Where it has the images."""
+    fits: PairFits
+    """How pairs fit it."""
+    doubted: BoolArray
+    """(n,) images that may stand elsewhere by their own matches."""
+    source: MapResult
+    """What it is one of."""
+    number: int
+    """Which of these it is."""
 
 
 def check_source(
@@ -133,7 +146,12 @@ def check_source(
     facts |= {"verdict": verdict, "residual_level_deg": level_deg, "timings_s": clock.seconds}
     facts |= {"evidence": told, "warnings": [*model.notes, *matches.matches.notes, *told.statements]}
     return CheckResult(
-        model=model, cameras=cameras, pairs=pairs, quality=quality, facts=CheckedFacts(**facts)
+        model=model,
+        cameras=cameras,
+        pairs=pairs,
+        quality=quality,
+        facts=CheckedFacts(**facts),
+        second_opinion=other and other.source,
     )
 
 
@@ -142,9 +160,13 @@ def _compare(
 ) -> SecondOpinion | None:
     """Return how another model compares; a single camera elsewhere is not, if the pixels confirm it here."""
     images = structure.images
-    second = compare_models(images, fits, *other)
-    elsewhere = [] if second is None else [*second.wrong, *second.undecided]
-    if second is None or len(elsewhere) != 1:  # several that are wrong together see false points together
+    second = compare_models(images, fits, other.images, other.fits, other.doubted)
+    if second is None:
+        return None
+    grade = other.source.models[other.number].located.verdict.grade
+    second = second._replace(grade=grade, folder=str(other.number))
+    elsewhere = [*second.wrong, *second.undecided]
+    if len(elsewhere) != 1:  # several that are wrong together see false points together
         return second
     sure = ask_pixels(matches, structure, np.isin(np.arange(images.num_images), elsewhere))
     return second._replace(wrong=second.wrong[:0], undecided=second.undecided[:0]) if sure.any() else second
@@ -214,12 +236,21 @@ def _reasons(
 ) -> Iterator[Reason]:
     """Yield what speaks against a model; a weak camera that stands where another model has it is right."""
     pointless = model.reconstruction.num_points3D() == 0
-    yield from _reasons_against(model.images, fits, is_bare=pointless and not matches.inputs.database)
+    centers = model.images.centers
+    if np.ptp(centers, axis=0).max() <= _ROUNDING * np.abs(centers).max():
+        clause = "all its cameras stand at the same place; place them with sfm-shapefit locate"
+        yield Reason(kind=Kind.PLACE, sentence=clause, grade=Grade.DO_NOT_USE)
+        return
+    if fits is None or not (fits.contradicts.any() or np.isfinite(fits.residuals_deg).any()):
+        is_bare = pointless and not matches.inputs.database
+        clause = "no two of its images have matches that say how they stand to each other"
+        clause = "it has no 3D points, and no database was given or found" if is_bare else clause
+        yield Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED)
     yield from too_few_to_judge(model.images.num_images)
     against = list(weigh_evidence(evidence, model.images))
     yield from against
     if fits is not None and not any(one.grade is Grade.DO_NOT_USE for one in against):
-        yield from _strange_pairs(fits)
+        yield from _strange_pairs(fits, has_database=matches.inputs.database is not None)
     confirmed = [] if evidence.second is None else evidence.second.confirmed.tolist()
     right = {model.images.names[k] for k in confirmed}
     yield from (one for one in weak if not right.issuperset(one.images))
@@ -231,23 +262,12 @@ def _reasons(
         yield Reason(kind=Kind.INPUT, sentence=clause)
 
 
-def _reasons_against(images: Images, fits: PairFits | None, *, is_bare: bool) -> Iterator[Reason]:
-    """Yield that a model has no shape, or that no pair says anything of it; poses alone are bare."""
-    if np.ptp(images.centers, axis=0).max() <= _ROUNDING * np.abs(images.centers).max():
-        clause = "all its cameras stand at the same place; place them with sfm-shapefit locate"
-        yield Reason(kind=Kind.PLACE, sentence=clause, grade=Grade.DO_NOT_USE)
-    elif fits is None or not (fits.contradicts.any() or np.isfinite(fits.residuals_deg).any()):
-        clause = "no two of its images have matches that say how they stand to each other"
-        clause = "it has no 3D points, and no database was given or found" if is_bare else clause
-        yield Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED)
-
-
-def _strange_pairs(fits: PairFits) -> Iterator[Reason]:
+def _strange_pairs(fits: PairFits, *, has_database: bool) -> Iterator[Reason]:
     """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
     if fits.contradicts.any() and not fits.agrees.any():
-        clause = (
-            f"{counted(int(fits.contradicts.sum()), 'pair')} contradict it and none agrees: {IS_ITS_DATABASE}"
-        )
+        count = int(fits.contradicts.sum())
+        clause = f"{counted(count, 'pair')} contradict{'s' * (count == 1)} it and none agrees"
+        clause += f": {IS_ITS_DATABASE}" * has_database
         yield Reason(kind=Kind.INPUT, sentence=clause, grade=Grade.DO_NOT_USE)
 
 
@@ -277,6 +297,7 @@ def _tell(
         "loose_groups": [],
         "versions": {"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
         "mean_reprojection_error_px": float(errors_px.mean()) if len(errors_px) else np.nan,
+        "num_lenses": len(np.unique(model.images.lens_of)),
         "median_track_length": _median(quality.point_track_lengths.tolist()),
     }
 

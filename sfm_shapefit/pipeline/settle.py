@@ -24,7 +24,7 @@ from sfm_shapefit.base.geometry import fit_similarity, fit_similarity_l1, median
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
 from sfm_shapefit.facts.options import PlacingOptions
-from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.facts.result import NO_POINTS, LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
 from sfm_shapefit.facts.warnings import (
     ambiguity_warnings,
@@ -330,7 +330,7 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
     yield from found.told_evidence.statements
     yield from intrinsics_warnings(found.intrinsics.rows(images))
     yield from match_warnings(stand.directions)
-    yield from quality_warnings(found.placement)
+    yield from quality_warnings(found.placement, found.options.placement)
     yield from trust_warnings(found.placement, found.kept)
     yield from ambiguity_warnings(found.placement)
     yield from stand.failures
@@ -342,7 +342,7 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
         limit = f"max_memory_mb={found.options.memory.max_memory_mb}"
         yield f"to stay below {limit}, {stand.source.economy.statement}"
     if found.model.num_points3D() == 0:
-        yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
+        yield f"{NO_POINTS}; bundle adjustment has nothing to start from"
     if names := stand.source.matches.missing_names:
         yield f"the database lacks {counted(len(names), 'image')} of the model: {first_of(names)}"
     yield from prior_warnings(found.prior_fit, images.names)

@@ -96,12 +96,12 @@ class SecondConfiguration:
         """Say what was found and what to do, for the user."""
         what = self.found.value.format(self.num_pairs, len(self.cameras), self.num_against)
         if self.is_as_good:
-            return f"{what}; sides or segments of the scene look alike: leave out pairs between those"
-        return f"{what}: repeated structure, or two scenes in one; do not trust it without a look"
+            return f"{what}; where sides or segments of the scene look alike, leave out pairs between these"
+        return f"{what}: repeated structure, or two scenes in one"
 
 
 def find_rival(refined: RefinedPlacement) -> SecondConfiguration | None:
-    """Return another end of the refinement that explains the pairs nearly as well, the best of them, if any."""
+    """Return the best other end of the refinement that explains nearly as much, if any."""
     kept, spread = refined.posterior > 0.5, median_spread(refined.locations)
     for rival in refined.rivals:
         theirs = rival.end.posterior > 0.5

@@ -256,7 +256,9 @@ class Mixture:
         information, likelihood = np.empty_like(expected), np.empty(len(expected))
         sums, weights = np.zeros_like(shares), shares * np.r_[1.0, np.full(len(_LEVELS_RAD), self._peak)]
         levels = np.maximum(_LEVELS_RAD, floor)
-        _expect(expected, self._own if own is None else own, levels**2, weights, (information, likelihood, sums))
+        _expect(
+            expected, self._own if own is None else own, levels**2, weights, (information, likelihood, sums)
+        )
         return information, likelihood, sums
 
     def _fit(self, expected: FloatArray, shares: FloatArray, floor: float) -> FloatArray:
@@ -273,7 +275,9 @@ class Mixture:
         information, likelihood, _ = self._expect(at.errors**2 + noise.variances, shares, 0.0)
         right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
         variances = np.maximum(right, _TINY) / np.maximum(information.mean(axis=1), _TINY)
-        left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)  # of an error, without the pair
+        left = 1.0 - np.minimum(
+            information * noise.variances, _MOST_LEVERAGE
+        )  # of an error, without the pair
         alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
         likelihood = self._expect((at.errors / left) ** 2, shares, 0.0, self._own + alone)[1]
         right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))

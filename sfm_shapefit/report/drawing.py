@@ -322,7 +322,7 @@ def _class_of(row: PairRow) -> PairClass:
         return PairClass.NO_DIRECTION
     if row.verdict == Verdict.UNDETERMINED.value:
         return PairClass.UNDETERMINED
-    return PairClass.AGREES if row.verdict == Verdict.INLIER.value else PairClass.CONTRADICTS
+    return PairClass.CONTRADICTS if row.contradicts else PairClass.AGREES
 
 
 def _angles_at(locations: FloatArray | None, ends: IntArray, directions: FloatArray) -> FloatArray:

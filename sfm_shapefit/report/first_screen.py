@@ -85,7 +85,7 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
     placed = set(np.array(drawing.cameras.names)[drawing.cameras.placed].tolist())
     doubted = [name for name in facts.verdict.cameras if name in placed]
     left_out = [name for name in facts.verdict.cameras if name not in placed]
-    is_weak = all(one.kind is Kind.POINTS for one in facts.verdict.findings if one.images)
+    is_weak = {one.kind for one in facts.verdict.findings if one.images} == {Kind.POINTS}
     weak = f"{'is' if len(doubted) == 1 else 'are'} weak" if is_weak else "may be wrong"
     parts = [f"{_named(doubted)} {weak}"] if doubted else []
     if left_out:

@@ -15,11 +15,11 @@ from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.wording import make_printable
 from sfm_shapefit.facts.model import FactsOfModel
 from sfm_shapefit.facts.placed import Facts
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.report.drawing import Drawing, PairClass
 
 MAX_TEXT = 160  # characters of a name or sentence that are shown; strangers may write longer ones
-_FAR_DEG = 1.0  # degrees, residual of a pair; repeated structure and wrong rotations are off by more
 _SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 _FEW_PAIRS = 4  # contradicting pairs; that most are of one camera says nothing where there are fewer
 _HAVE_TABLES = {"intrinsics", "control points", "video"}
@@ -62,6 +62,8 @@ def summary_sentences(drawing: Drawing, facts: Facts) -> list[str]:
 
 def first_looks(drawing: Drawing, facts: Facts) -> list[Hint]:
     """Return what deserves a look, the most telling first; empty if nothing does."""
+    if facts.verdict.grade is Grade.GOOD:  # what is of note there is no task
+        return list(_warnings(drawing, facts, set()))
     cameras = [*_left_out(drawing), *_least_trusted(drawing), *_weak(drawing, facts)]
     return [
         *_warnings(drawing, facts, {hint.camera for hint in cameras}),
@@ -162,14 +164,12 @@ def _weak(drawing: Drawing, facts: Facts) -> Iterator[Hint]:
 def _contradictions(drawing: Drawing, *, is_told: bool) -> Iterator[Hint]:
     """Yield the contradicting pairs with most matches: repeated structure, or wrong rotations.
 
-    How many there are comes first, if that `is_told` by no warning; those that are off by little only count.
+    How many there are comes first, if that `is_told` by no warning.
     """
     pairs = drawing.pairs
     against = np.flatnonzero(pairs.classes == PairClass.CONTRADICTS)
-    far = pairs.residuals_deg[against] >= _FAR_DEG
     if len(against) and not is_told:
         yield _set_aside(drawing, against)
-    against = against[far]
     order = np.lexsort((-pairs.residuals_deg[against], -pairs.support[against]))
     for row in against[order][:_SHOWN].tolist():
         first, second = (shorten(drawing.cameras.names[k], 60) for k in pairs.cameras[row].tolist())
@@ -181,17 +181,14 @@ def _contradictions(drawing: Drawing, *, is_told: bool) -> Iterator[Hint]:
 
 
 def _set_aside(drawing: Drawing, against: IntArray) -> Hint:
-    """Say how many pairs contradict the placed cameras, by how much if it is little, and whose they are."""
+    """Say how many pairs contradict the placed cameras, and whose they are."""
     pairs, count = drawing.pairs, len(against)
     verb = "contradicts" if count == 1 else "contradict"
     judged = int(np.sum(pairs.classes != PairClass.NO_DIRECTION))
     text = f"{count:,} of {judged:,} pairs {verb} the placed {drawing.noun}s"
     if np.isfinite(drawing.cameras.trust).any():
         text += f" and {_are(count)} set aside"
-    largest = float(pairs.residuals_deg[against].max())
-    if largest < _FAR_DEG:
-        text += f"; by {largest:.2g} degrees at most, which does no harm"
-    elif np.any(pairs.support > 0):
+    if np.any(pairs.support > 0):
         text += ": repeated structure, as a rule, if they have many matches"
     shares = np.bincount(pairs.cameras[against].ravel(), minlength=len(drawing.cameras.names))
     most = int(np.argmax(shares))

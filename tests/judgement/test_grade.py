@@ -52,7 +52,8 @@ def test_doubtful_and_left_out_cameras_are_named_the_left_out_first(found):
     names = found.images.names
     assert verdict.grade is Grade.LOOK
     assert verdict.cameras == (names[5], names[2], names[1])
-    assert verdict.statement == f"look at 3 cameras ({names[5]}, {names[2]}, {names[1]})"
+    there = f"look at 2 cameras ({names[2]}, {names[1]})"
+    assert verdict.statement == f"{there}; 1 image is left out ({names[5]})"
 
 
 @pytest.mark.parametrize(

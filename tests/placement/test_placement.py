@@ -8,9 +8,10 @@ import pytest
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.facts.rows import camera_rows, pair_rows
-from sfm_shapefit.facts.warnings import graph_warnings, quality_warnings
+from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.grade import judge_graph
 from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.place import Placement, place_pieces
@@ -107,9 +108,13 @@ def test_a_piece_that_no_scale_fits_is_left_out_and_a_graph_without_a_triangle_i
 
 def test_directions_that_do_not_fit_together_and_mostly_contradicting_pairs_raise_the_alarm():
     noise, clean = (random_graph_problem(14, 1.0, sigma=1e-4, q=q, seed=3).view_graph for q in (1.0, 0.0))
-    assert any("deg off the solution" in warning for warning in graph_warnings(place(noise)))
+    assert "degrees off the cameras" in judge_graph(place(noise)).statement
     placement = place(clean)
     assert list(quality_warnings(placement)) == []
     few = dataclasses.replace(placement.agreement, agrees=np.arange(clean.num_edges) % 3 == 0)
-    warnings = list(quality_warnings(dataclasses.replace(placement, agreement=few)))
-    assert any("66% of the pairs contradict the solution" in warning for warning in warnings)
+    for off_deg, warned in ((0.05, False), (5.0, True)):  # by a twentieth of a degree nothing contradicts
+        residuals_deg = np.full(clean.num_edges, off_deg)
+        assessment = dataclasses.replace(placement.assessment, residuals_deg=residuals_deg)
+        doubted = dataclasses.replace(placement, agreement=few, assessment=assessment)
+        told = [one for one in quality_warnings(doubted) if "66% of the pairs contradict the solution" in one]
+        assert bool(told) == warned

@@ -58,8 +58,10 @@ const drawFacts = () => {
   }));
   fill("summary", ...data.summary.map((text) => element("li", text)));
   fill("expert-facts", ...data.expertFacts.map((text) => element("li", text)));
+  const isGood = data.banner.grade === "good";
+  if (isGood) $("looks-title").textContent = "Of note";
   const looks = data.looks.map(({ text, camera, pair }) => {
-    const item = element("li");
+    const item = element("li", "", isGood ? "fine" : "");
     const target = camera ?? pair;
     if (target === null) item.append(element("span", text));
     else item.append(button(text, "link", () => select(camera === null ? "pair" : "camera", target)));
