@@ -1,4 +1,4 @@
-"""Result of `place` in Python: the placement of a bare graph, whether it can be used, and what to know of it."""
+"""Result of `place` in Python: the placement of a bare graph, and whether it can be used."""
 
 from dataclasses import dataclass, fields
 from typing import Any, Self

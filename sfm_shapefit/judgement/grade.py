@@ -6,7 +6,7 @@ Do not use, if any of these holds:
     however many contradict
     of a bare graph, the residuals of its directions have a level above 6 degrees; another placement explains
     the pairs nearly as well, or triangles speak for most of the pairs that it rejects
-    (`placement.second_configuration`); or more than a third of the cameras is uncertain
+    (`placement.second_configuration`); or most cameras are uncertain by more than a tenth of the extent
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than half of all images are in the output
@@ -18,8 +18,8 @@ Do not use, if any of these holds:
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
 placed but are not in the output, that are kept though their matches make no points, that many pairs
 contradict and no pixels confirm (`witnesses`), or that evidence which the fit did not use names: another
-place, a seam, a wrong lens; in a bare graph also those that few pairs tie to the rest (`few_ties`). Trust is not low where the pixels confirm a camera. Look also, though no camera
-can be named, if
+place, a seam, a wrong lens; in a bare graph also those that few pairs tie to the rest (`few_ties`). Trust
+is not low where the pixels confirm a camera. Look also, though no camera can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade
     many rejected pairs agree on a second configuration
@@ -157,11 +157,10 @@ def judge_graph(placement: Judged) -> ModelVerdict:
     if level > MOST_LEVEL_DEG:
         clause = f"the directions are {level:.0f} degrees off the cameras"
         reasons.append(Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE))
-    count, uncertain = len(placement.cameras), len(uncertain_cameras(placement))
-    if uncertain > MANY * count:
-        clause = (
-            f"{uncertain} of {counted(count, 'camera')} are uncertain by more than {RARE:.0%} of the extent"
-        )
+    count, extent = len(placement.cameras), _extent(placement.locations)
+    unheld = int(np.sum(largest_sigmas(placement) > FEW * extent))
+    if unheld > HALF * count:
+        clause = f"{unheld} of {counted(count, 'camera')} are uncertain by more than {FEW:.0%} of the extent"
         reasons.append(Reason(kind=Kind.UNCERTAIN, sentence=clause, grade=Grade.DO_NOT_USE))
     if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
         clause = "no pair is checked by others"
@@ -175,19 +174,20 @@ def _few_ties(placement: Judged) -> Iterator[Reason]:
     edges, count = graph.edges[agrees], graph.num_nodes
     shares = largest_sigmas(placement) / _extent(placement.locations)
     for few in find_few_ties(count, edges):
-        some = counted(few.num_pairs, "agreeing pair")
-        clause = f"{some} only tie {len(few.cameras)} cameras to the rest, {_known_to(shares[few.cameras])}"
+        some = f"{counted(few.num_pairs, 'agreeing pair')} {'ties' if few.num_pairs == 1 else 'tie'}"
+        clause = f"only {some} {len(few.cameras)} cameras to the rest, {_known_to(shares[few.cameras])}"
         names = tuple(map(graph.name_of, few.cameras.tolist()))
         yield Reason(kind=Kind.UNCHECKED, sentence=clause, images=names)
     for k in np.flatnonzero(barely_held(count, edges, graph.directions[agrees])).tolist():
-        clause = f"fewer than three of its agreeing pairs differ in direction; it is {_known_to(shares[[k]])}"
+        clause = f"fewer than three of its agreeing pairs differ in direction, {_known_to(shares[[k]])}"
         yield from of_each(Kind.UNCHECKED, [graph.name_of(k)], clause)
 
 
 def _known_to(shares: FloatArray) -> str:
-    """Say how uncertain cameras of some standard deviations are, which are shares of the extent."""
+    """Say how well cameras of some standard deviations, which are shares of the extent, are placed."""
     largest = float(shares.max())
-    return f"known to ± {100.0 * largest:.2g} % of the extent" if largest < 1.0 else "not determined"
+    known = f"known to ± {100.0 * largest:.2g} % of the extent" if largest < 1.0 else "not determined"
+    return f"so that its place is {known}" if len(shares) == 1 else f"whose place is {known}"
 
 
 def judge_model(

@@ -4,25 +4,26 @@
 kept. Pairs that both explain decide nothing between them; where the other explains more than half as many
 alone as the kept one does alone, the directions decide nothing either. Where half of all pairs are shifted
 along a corridor whose segments repeat, that number was 0.69 to 1.15 times the kept one's, whichever of the
-two was right, and the ends stood 2 % of the extent apart. It was 0.05 to 0.22 for folds of rotation-symmetric
-scenes, which lose, and 0.45 where a quarter of the pairs is shifted along the corridor.
+two was right, and the ends stood 2 % of the extent apart. It was 0.05 to 0.22 for folds of
+rotation-symmetric scenes, which lose, and 0.45 where a quarter of the pairs is shifted along the corridor.
 
 2. *A fold*, in a bare graph. Where a scene has four equal sides, a placement may lay them over one another:
-it explains wrong pairs, and rejects right ones, which close triangles with others. So the placement is a fold
-if it rejects more than a third of all pairs, and triangles (`refinement.posterior`) speak for most of these:
-for 52 to 66 % in folds, for 45 % at most where the answer is right, for 20 % of random pairs.
+it explains wrong pairs, and rejects right ones, which close triangles with others. So the placement is a
+fold if it rejects more than a third of all pairs, and triangles (`refinement.posterior`) speak for most of
+these: for 52 to 66 % in folds, for 45 % at most where the answer is right, for 20 % of random pairs.
 
-3. *The rejected pairs by themselves*. Pairs that are wrong at random contradict each other as much as the solution. Pairs of repeated structure
-(facades, a symmetric object) agree with one another on a second configuration, and where they are many the
-solution may be a compromise, or the wrong one of the two. So the rejected pairs are solved by themselves.
+3. *The rejected pairs by themselves*. Pairs that are wrong at random contradict each other as much as the
+solution. Pairs of repeated structure (facades, a symmetric object) agree with one another on a second
+configuration, and where they are many the solution may be a compromise, or the wrong one of the two. So the
+rejected pairs are solved by themselves.
 
-n cameras have d (n - 1) - 1 unknowns, and a direction d - 1 equations: even random directions can be made to
-agree as far as there are unknowns, at most f = (d (n - 1) - 1) / (d - 1) pairs of them. The share
-(agreeing - f) / (all - f) of the pairs beyond these was -2.7 to -0.1 for random ones, and 0.5 to 1 where all
-wrong pairs agree on one configuration.
+n cameras have d (n - 1) - 1 unknowns, and a direction d - 1 equations: even random directions can be made
+to agree as far as there are unknowns, at most f = (d (n - 1) - 1) / (d - 1) pairs of them. The share
+(agreeing - f) / (all - f) of the pairs beyond these was -2.7 to -0.1 for random ones, and 0.5 to 1 where
+all wrong pairs agree on one configuration.
 
-The program of 3 is LUD (Ozyesil, Singer 2015, "Robust camera location estimation by convex programming"), a few
-iterations, which cost some hundredths of the placement.
+The program of 3 is LUD (Ozyesil, Singer 2015, "Robust camera location estimation by convex programming"), a
+few iterations, which cost some hundredths of the placement.
 """
 
 import enum
@@ -41,6 +42,7 @@ from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.splitting.lud import solve_lud
 
 _NEARLY_AS_MANY = 0.5  # ratio of pairs; an explanation with twice as many is believed
+_FEWEST_ALONE = 2  # pairs; so many fit by chance alone
 _MANY_REJECTED = 1.0 / 3.0  # share of pairs; right answers reject as many where wrong ones are random
 _MOST = 0.5  # share of the rejected pairs; see the header
 _LEAST_OF_AGREEING = 0.2  # share of the solution's pairs; a smaller second configuration is chance
@@ -107,7 +109,7 @@ def find_rival(refined: RefinedPlacement) -> SecondConfiguration | None:
         theirs = rival.end.posterior > 0.5
         alone, against = int(np.sum(theirs & ~kept)), int(np.sum(kept & ~theirs))
         apart = _median_distance(rival.end.locations, refined.locations)
-        if apart > LOOSE_SHARE * spread and alone > _NEARLY_AS_MANY * against:
+        if apart > LOOSE_SHARE * spread and alone > max(_NEARLY_AS_MANY * against, _FEWEST_ALONE):
             nodes = np.arange(len(refined.locations))
             return SecondConfiguration(
                 found=Found.BY_A_START, cameras=nodes, num_pairs=alone, num_against=against

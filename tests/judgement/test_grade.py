@@ -17,6 +17,7 @@ from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.prior_fit import PriorFit
+from sfm_shapefit.placement.second_configuration import Found, SecondConfiguration
 from tests.program import run
 from tests.scenes import BUNDLED
 
@@ -104,8 +105,10 @@ def test_one_prior_may_be_wrong_and_two_of_eight_make_a_look_worthwhile(found):
 
 
 def test_rejected_pairs_that_agree_on_a_second_configuration_make_a_look_worthwhile(found):
-    second = replace(found.placement, second_configuration=object())
-    verdict = replace(found, placement=second).verdict
+    seen = SecondConfiguration(
+        found=Found.BY_REJECTED_PAIRS, cameras=np.arange(8), num_pairs=9, num_against=20
+    )
+    verdict = replace(found, placement=replace(found.placement, second_configuration=seen)).verdict
     assert verdict.statement == "look: many rejected pairs agree on a second configuration"
 
 
