@@ -23,7 +23,6 @@ from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.jit import array_address, inner_kernel, kernel
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.laplacian.dense import blas_of, gemm, trsm
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
 _STRIP = 64  # rows of a product of which only a triangle is wanted
 _Solve = Callable[[FloatArray], FloatArray]
