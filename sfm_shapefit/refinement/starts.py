@@ -88,6 +88,16 @@ class Start:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rival:
+    """Another explanation of the directions than the kept one."""
+
+    end: MixtureEnd
+    """Its locations (n, d), in a scale and from an origin of their own, and which directions it explains."""
+    behind: float
+    """Nats of evidence that the kept explanation has more, both at the noise of the noisier of the two."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RefinedPlacement:
     """The locations that are kept, and why."""
 
@@ -122,6 +132,9 @@ class RefinedPlacement:
     """The program at other weights that the locations come from, certified; None where another was kept."""
     variances: FloatArray | None = None
     """(m,) variance per axis of each direction if it is right, rad^2; None where one level serves all."""
+
+    rivals: tuple[Rival, ...] = ()
+    """Where other starts led to under a mixture, most evidence first; the same place as the kept one, often."""
 
     @property
     def collapsed(self) -> bool:
@@ -206,6 +219,7 @@ def refine_starts(
         posterior=kept.posterior,
         reweighted=kept.reweighted,
         variances=kept.variances,
+        rivals=kept.rivals,
     )
 
 
@@ -220,6 +234,7 @@ class _Kept(NamedTuple):
     posterior: FloatArray
     reweighted: Reweighted | None
     variances: FloatArray | None = None
+    rivals: tuple[Rival, ...] = ()
 
 
 def _find_best_fit(problem: _Problem, options: PlacementOptions) -> _Kept:
@@ -279,8 +294,12 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
     candidates = _descend_from_starts(model, problem, options)
     if not candidates:
         return None
-    best = max(candidates, key=lambda candidate: candidate.end.bound)
+    best = candidates[0]
+    for other in candidates[1:]:
+        best = other if model.lead(other.end, best.end) > 0.0 else best
     end = model.improve(best.end)
+    others = (found.end for found in candidates if found is not best)
+    rivals = sorted((Rival(end=x, behind=model.lead(end, x)) for x in others), key=lambda rival: rival.behind)
     if projected_length(measured.graph, end.locations) <= 0.0:
         return None
     levels = np.array([np.sqrt(np.median(end.variances))])
@@ -293,7 +312,7 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
     if best.reweighted is not None:
         reason += f"; {_say_certified(best.reweighted)}"
     costs = {found.name: -found.end.bound for found in candidates}
-    return _Kept(start, reason, costs, levels, end.posterior, best.reweighted, end.variances)
+    return _Kept(start, reason, costs, levels, end.posterior, best.reweighted, end.variances, tuple(rivals))
 
 
 def _descend_from_starts(model: Mixture, problem: _Problem, options: PlacementOptions) -> list[_Candidate]:
@@ -310,7 +329,7 @@ def _descend_from_starts(model: Mixture, problem: _Problem, options: PlacementOp
         ("ShapeFit at triangles", _by_triangles, _EXPLAINED),
         ("reweighted ShapeFit", _by_posteriors, _POORLY_EXPLAINED),
     ):
-        best = max(candidates, key=lambda candidate: candidate.end.bound).end
+        best = max((candidate.end for candidate in candidates), key=lambda end: end.right_share)
         if best.right_share >= share or (found := weigh(problem, best, options)) is None:
             continue
         reweighted, start = found
