@@ -154,12 +154,12 @@ def too_few_to_judge(num_cameras: int) -> Iterator[Reason]:
 def judge_graph(placement: Judged) -> ModelVerdict:
     """Return the verdict on a placed graph, which has no observations."""
     level, assessment, reasons = placement.assessment.level_deg, placement.assessment, list[Reason]()
+    count, extent = len(placement.cameras), _extent(placement.locations)
+    unheld = int(np.sum(largest_sigmas(placement) > FEW * extent))
     if level > MOST_LEVEL_DEG:
         clause = f"the directions are {level:.0f} degrees off the cameras"
         reasons.append(Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE))
-    count, extent = len(placement.cameras), _extent(placement.locations)
-    unheld = int(np.sum(largest_sigmas(placement) > FEW * extent))
-    if unheld > HALF * count:
+    elif unheld > HALF * count:
         clause = f"{unheld} of {counted(count, 'camera')} are uncertain by more than {FEW:.0%} of the extent"
         reasons.append(Reason(kind=Kind.UNCERTAIN, sentence=clause, grade=Grade.DO_NOT_USE))
     if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
