@@ -241,7 +241,7 @@ def mixed(rng: np.random.Generator) -> Made:
 def object_scan(rng: np.random.Generator) -> Made:
     """Return images around an object before a plain wall, of which it fills a small part."""
     draft = ring(rng)
-    draft.focal_px[:] = 500.0
+    draft.focal_px[:] = 350.0
     draft.see(rng)
     return Made(draft.written(one_lens=True), is_sound=True)
 

@@ -14,6 +14,7 @@ from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion, fit_pa
 from sfm_shapefit.judgement.grade import weigh_evidence
 from sfm_shapefit.judgement.image_quality import image_quality
 from sfm_shapefit.judgement.places import OtherPlace
+from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason
 from sfm_shapefit.pipeline import checked
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.map import map_database
@@ -49,15 +50,11 @@ def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path, ring_ma
     assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
     assert "image_undistorter" in banner(drawing, facts)["command"]
 
-    moved = pycolmap.Reconstruction(RING / "sparse" / "0")
-    image = moved.image(sorted(moved.reg_image_ids())[2])
-    pose = image.frame.rig_from_world
-    image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([1.0, 0.0, 0.0]))
-    moved.write(tmp_path)
-    found = check(tmp_path, RING / "database.db", second_opinion=ring_mapped)
+    moved, name = with_one_displaced(tmp_path / "moved")
+    found = check(moved, RING / "database.db", second_opinion=ring_mapped)
     drawing, facts = found.drawing, found.facts
-    assert facts.verdict.cameras == (image.name,)
-    row = drawing.cameras.names.index(image.name)
+    assert facts.verdict.cameras == (name,)
+    row = drawing.cameras.names.index(name)
     assert "pairs contradict where it stands" in drawing.cameras.reasons[row]
     assert "its reprojection error is" in drawing.cameras.reasons[row]
     wrong = drawing.pairs.cameras[drawing.pairs.classes == PairClass.CONTRADICTS]
@@ -262,3 +259,60 @@ def test_json_has_the_figures_and_pictures_need_a_page(tmp_path):
     assert "--report" in run_refused("check", RING / "sparse" / "0", "--images", tmp_path)
     page = ("--report", tmp_path / "page.html", "--images", tmp_path)
     assert "has none of the images" in run_refused("check", RING / "sparse" / "0", *page)
+
+
+def with_one_displaced(folder):
+    """Write ring8 with one camera a unit away."""
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    image = model.image(sorted(model.reg_image_ids())[2])
+    pose = image.frame.rig_from_world
+    image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([1.0, 0.0, 0.0]))
+    folder.mkdir()
+    model.write(folder)
+    return folder, image.name
+
+
+def test_the_second_opinion_is_kept_where_asked_and_is_the_next_step(tmp_path):
+    (model, name), out = with_one_displaced(tmp_path / "model"), tmp_path / "mapped"
+    database, keep = ("--database", RING / "database.db"), ("--second-opinion", out)
+    told = run("check", model, *database, *keep, code=0).stdout
+    assert f"--input_path {out}/0 " in told
+    assert pycolmap.Reconstruction(out / "0").num_reg_images() == 8
+    assert (out / "map.json").is_file()
+    assert "exists already" in run_refused("check", model, *database, *keep)
+    facts = json.loads(run("check", model, *database, *keep, "--overwrite", "--json", code=0).stdout)
+    assert facts["second_opinion"] == str(out)
+    assert facts["verdict"]["cameras"] == [name]
+    reasons = {one["kind"]: one for one in facts["verdict"]["findings"]}
+    assert all(one["images"] == [name] for one in reasons.values())
+    assert "reprojection error" in reasons["points"]["sentence"]
+    assert "give one" in run_refused("check", model, *database, *keep, "--no-second-opinion")
+    assert "needs the database" in run_refused("check", model, "--second-opinion", tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_two_cameras_cannot_be_judged_whichever_command_is_asked(tmp_path):
+    two = spoiled(tmp_path / "two", num_posed=2)
+    told = run("check", two, "--strict", code=4).stdout
+    assert "verdict: cannot be judged: it has two cameras only" in told
+    located = run("locate", two, tmp_path / "out", "--strict", "--no-report", code=4).stdout
+    assert "verdict: cannot be judged: it has two cameras only" in located
+    assert (tmp_path / "out" / "locate.json").is_file()
+
+
+def test_images_without_a_pose_are_no_cameras_to_look_at():
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    last = model.image(max(model.reg_image_ids()))
+    model.deregister_frame(last.frame_id)
+    found = check(model, second_opinion=False)
+    assert (found.verdict.grade, found.verdict.cameras) == ("good", ())
+    rows = {row.label: row.lines for row in found.facts.told(found.cameras, found.pairs).rows}
+    assert (rows["without a pose"], rows["weak"]) == ([last.name], [])
+
+
+def test_lenses_that_cannot_be_ask_for_one_lens_per_device_and_a_single_one_for_its_calibration():
+    facts = check(RING / "sparse/0", second_opinion=False).facts
+    odd = ModelVerdict.weigh([Reason(kind=Kind.LENS, sentence="a lens is 42 widths long")])
+    for num_lenses, advice in ((8, "--ImageReader.single_camera 1"), (1, "--intrinsics all")):
+        step = replace(facts, verdict=odd, num_lenses=num_lenses).next_step
+        assert advice in step.command

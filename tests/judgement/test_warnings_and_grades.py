@@ -1,0 +1,150 @@
+"""What warnings say and what the verdict says go together: a doubt is a reason, and advice the verdict's."""
+
+import ast
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.facts.evidence import tell_evidence
+from sfm_shapefit.facts.warnings import match_warnings, quality_warnings, support_warnings, trust_warnings
+from sfm_shapefit.judgement.evidence import Contradicted, ModelEvidence, SecondOpinion
+from sfm_shapefit.judgement.places import OtherPlace
+from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each
+from sfm_shapefit.judgement.seams import Seam
+from sfm_shapefit.judgement.ties import Untied
+from sfm_shapefit.judgement.wrong_lenses import WrongLens
+from sfm_shapefit.pairs.pair_directions import DirectionStatus
+from sfm_shapefit.placement.second_configuration import SecondConfiguration
+
+PACKAGE = Path(sfm_shapefit.__file__).parent
+ADVICE = re.compile("trust it|without a look|do not use|can(not)? be used|is sound|is good", re.IGNORECASE)
+SPEAKERS = {"judgement/reasons.py", "report/first_screen.py"}
+"""What says what a model is worth."""
+NONE = np.zeros(0, dtype=np.int64)
+SECOND = SecondOpinion(8, 0.01, NONE, NONE, NONE, 0, 3, NONE)
+
+
+def place(camera):
+    return OtherPlace(camera, 5, 6, np.ones(3), np.zeros((5, 2), dtype=int))
+
+
+EVIDENCE = {
+    "lenses": ModelEvidence(lenses=(WrongLens(0, 1.2, 0.01, 8, 20.0),)),
+    "places": ModelEvidence(places=(place(3),)),
+    "seams": ModelEvidence(seams=(Seam(np.array([1, 2]), 0, 9, 0, float("nan")),)),
+    "loose": ModelEvidence(untied=(Untied(np.array([1, 2]), 1, 2, 0, is_loose=True),)),
+    "untied": ModelEvidence(untied=(Untied(np.array([1, 2]), 1, 2, 0, is_loose=False),)),
+    "contradicted": ModelEvidence(contradicted=(Contradicted(2, 9, 5),)),
+    "wrong by a second opinion": ModelEvidence(second=SECOND._replace(wrong=np.array([2]))),
+    "undecided": ModelEvidence(second=SECOND._replace(undecided=np.array([2, 4]))),
+    "ambiguous": ModelEvidence(second=SECOND._replace(ambiguous=np.array([2]))),
+}
+
+
+def uncertain(found):
+    covariances, extent = found.placement.covariances.copy(), np.ptp(found.placement.locations, axis=0).max()
+    covariances[2] = extent**2 * np.eye(3)
+    placement = replace(found.placement, adjusted_covariances=covariances)
+    return replace(found, placement=placement), quality_warnings(placement)
+
+
+def second_configuration(found):
+    cameras, far = np.array([1, 2]), SecondConfiguration
+    second = far(**{name: cameras if name == "cameras" else 9 for name in far.__dataclass_fields__})
+    placement = replace(found.placement, second_configuration=second)
+    return replace(found, placement=placement), quality_warnings(placement)
+
+
+def left_out(found):
+    kept = np.arange(8) != 3
+    return replace(found, kept=kept), trust_warnings(found.placement, kept)
+
+
+def unsupported(found):
+    told = replace(found, unsupported=np.arange(8) == 3)
+    return told, support_warnings([found.images.names[3]], is_kept=True)
+
+
+def twofold(found, status=DirectionStatus.TWO_MOTIONS):
+    statuses = tuple(status if k % 3 else one for k, one in enumerate(found.directions.status))
+    told = replace(found, directions=replace(found.directions, status=statuses))
+    return told, match_warnings(told.directions)
+
+
+def contradicting_rotations(found):
+    return twofold(found, DirectionStatus.LOW_INLIER_RATIO)
+
+
+DOUBTS = (uncertain, second_configuration, left_out, unsupported, twofold, contradicting_rotations)
+
+
+@pytest.mark.parametrize("doubt", DOUBTS)
+def test_a_warning_that_doubts_a_model_stands_over_no_good_one(ring_located, doubt):
+    told, warnings = doubt(ring_located)
+    assert list(warnings)
+    assert told.verdict.grade is not Grade.GOOD
+
+
+@pytest.mark.parametrize("name", EVIDENCE)
+def test_evidence_that_is_told_is_in_the_verdict_and_each_named_camera_has_its_reason(ring_located, name):
+    assert tell_evidence(EVIDENCE[name], ring_located.placed).statements
+    verdict = replace(ring_located, evidence=EVIDENCE[name]).verdict
+    assert verdict.grade is not Grade.GOOD
+    assert {image for one in verdict.findings for image in one.images} == set(verdict.cameras)
+    assert all(one.sentence for one in verdict.findings)
+
+
+def test_what_stands_beside_any_grade_says_nothing_of_it(ring_located):
+    agreement = replace(ring_located.placement.agreement, agrees=np.arange(len(ring_located.pairs)) % 3 == 0)
+    residuals_deg = np.full(len(agreement.agrees), 5.0)
+    assessment = replace(ring_located.placement.assessment, residuals_deg=residuals_deg)
+    certified = replace(ring_located.placement.certified, unique=False)
+    placement = replace(
+        ring_located.placement, agreement=agreement, assessment=assessment, certified=certified
+    )
+    warnings = list(quality_warnings(placement))
+    assert len(warnings) == 2
+    assert not any(ADVICE.search(one) for one in warnings)
+    assert replace(ring_located, placement=placement).verdict.grade is Grade.GOOD
+
+
+def test_only_the_verdict_says_what_a_model_is_worth():
+    """All sentences of the package, told in pieces or whole."""
+    said = []
+    for path in PACKAGE.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        described = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        texts = [
+            node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in described
+        ]
+        is_told = path.parts[-2] in ("facts", "judgement", "placement", "report")
+        if is_told and str(path.relative_to(PACKAGE)) not in SPEAKERS:
+            said += [(path.name, node.value) for node in texts if isinstance(node.value, str)]
+    assert len(said) > 1000
+    assert [(name, text) for name, text in said if ADVICE.search(text)] == []
+
+
+def test_the_worst_reason_decides_and_only_the_worst_are_told():
+    look = Reason(kind=Kind.LENS, sentence="images contradict 1 focal length", images=("b",))
+    cannot, bad = (Reason(kind=Kind.PAIRS, sentence=grade.value, grade=grade) for grade in list(Grade)[2:])
+    each = of_each(Kind.POINTS, ["a"], "it sees no 3D points")
+    assert ModelVerdict.weigh(()).grade is Grade.GOOD
+    for findings, grade in (
+        ([*each, look], "look"),
+        ([look, cannot], cannot.sentence),
+        ([bad, cannot], bad.sentence),
+    ):
+        verdict = ModelVerdict.weigh(findings)
+        assert verdict.grade == grade
+        assert verdict.is_usable == (grade == "look")
+        assert verdict.reasons == tuple(
+            one.sentence for one in findings if one.grade == grade and not one.of_each
+        )
+    assert ModelVerdict.weigh([*each, look]).cameras == ("a", "b")
+    first = Reason(kind=Kind.INPUT, sentence="its poses are those of OpenGL")
+    assert ModelVerdict.weigh([bad]).led_by(first).reasons == (first.sentence, bad.sentence)
+    assert ModelVerdict.weigh(()).led_by(first).grade is Grade.LOOK
