@@ -49,7 +49,7 @@ from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.solver.program import adjoint, differences
 
 _LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
-_NODES = np.linspace(-3.0, 3.0, 13)  # standard scores of log levels, at which their normal density is summed
+_NODES = np.linspace(-4.0, 4.0, 13)  # standard scores of log levels, at which their normal density is summed
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
 _NEXT_FLOOR = 2.0  # typical levels; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
@@ -71,7 +71,7 @@ _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
 _TYPICAL = 0.84  # standard score of a log level; the level that four of five have at most
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
 _UNKNOWN = 1e-6  # probability of being right; a direction of less has the usual variance
-_MOST_LEVERAGE = 0.999  # share of a residual's variance; nothing but the pair holds such a camera
+_MOST_LEVERAGE = 0.9  # share of a residual's variance; nothing but the pair holds such a camera
 _WEIGH_ROUNDS = 3  # of share and variances, at locations that stay
 _TINY = float(np.finfo(np.float64).tiny)
 _LARGEST_VARIANCE = 1.0  # rad^2; a direction that nothing determines has no more
