@@ -81,11 +81,12 @@ def judge(placement: Placement, options: PlacementOptions) -> Judged:
         max_bytes=options.solver.factor_bytes,
         agreement=agreement,
     )
-    second = None
-    if part.evidence is None:  # what matches say of a model says more of folds
-        second = find_rival(placement.refined) or find_fold(part.graph, agreement.agrees)
-    if second is None:
-        second = find_second_configuration(part.graph, part.pairs, agreement.agrees, assessment.level_deg)
+    is_bare = part.evidence is None  # what matches say of a model says more of folds
+    second = (
+        (find_rival(placement.refined) if is_bare else None)
+        or find_second_configuration(part.graph, part.pairs, agreement.agrees, assessment.level_deg)
+        or (find_fold(part.graph, agreement.agrees) if is_bare else None)
+    )
     if second is not None:
         second = replace(second, cameras=placement.nodes[second.cameras])
     as_placed = {item.name: getattr(placement, item.name) for item in fields(Placement)}

@@ -7,12 +7,7 @@ along a corridor whose segments repeat, that number was 0.69 to 1.15 times the k
 two was right, and the ends stood 2 % of the extent apart. It was 0.05 to 0.22 for folds of
 rotation-symmetric scenes, which lose, and 0.45 where a quarter of the pairs is shifted along the corridor.
 
-2. *A fold*, in a bare graph. Where a scene has four equal sides, a placement may lay them over one another:
-it explains wrong pairs, and rejects right ones, which close triangles with others. So the placement is a
-fold if it rejects more than a third of all pairs, and triangles (`refinement.posterior`) speak for most of
-these: for 52 to 66 % in folds, for 45 % at most where the answer is right, for 20 % of random pairs.
-
-3. *The rejected pairs by themselves*. Pairs that are wrong at random contradict each other as much as the
+2. *The rejected pairs by themselves*. Pairs that are wrong at random contradict each other as much as the
 solution. Pairs of repeated structure (facades, a symmetric object) agree with one another on a second
 configuration, and where they are many the solution may be a compromise, or the wrong one of the two. So the
 rejected pairs are solved by themselves.
@@ -22,8 +17,13 @@ to agree as far as there are unknowns, at most f = (d (n - 1) - 1) / (d - 1) pai
 (agreeing - f) / (all - f) of the pairs beyond these was -2.7 to -0.1 for random ones, and 0.5 to 1 where
 all wrong pairs agree on one configuration.
 
-The program of 3 is LUD (Ozyesil, Singer 2015, "Robust camera location estimation by convex programming"), a
+The program of 2 is LUD (Ozyesil, Singer 2015, "Robust camera location estimation by convex programming"), a
 few iterations, which cost some hundredths of the placement.
+
+3. *A fold*, in a bare graph. Where a scene has four equal sides, a placement may lay them over one another:
+it explains wrong pairs, and rejects right ones, which close triangles with others. So the placement is a
+fold if it rejects more than a third of all pairs, and triangles (`refinement.posterior`) speak for most of
+these: for 52 to 66 % in folds, for at most 45 % in right answers to such scenes, for 20 % of random pairs.
 """
 
 import enum
