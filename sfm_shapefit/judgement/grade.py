@@ -6,7 +6,8 @@ Do not use, if any of these holds:
     however many contradict
     of a bare graph, the residuals of its directions have a level above 6 degrees; another placement explains
     the pairs nearly as well, or triangles speak for most of the pairs that it rejects
-    (`placement.second_configuration`); or most cameras are uncertain by more than a tenth of the extent
+    (`placement.second_configuration`); most cameras are uncertain by more than a tenth of the extent; or a
+    tenth is uncertain, and more than a third has agreeing pairs of fewer than three directions (`few_ties`)
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than half of all images are in the output
@@ -39,16 +40,16 @@ stand right to 0.5 % of the extent), and 45 to 100 % of the pairs agree. Wrong p
 do not make a model bad.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import distances_in_spreads
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.few_ties import barely_held, find_few_ties
+from sfm_shapefit.judgement.few_ties import FewTies, barely_held, find_few_ties
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import (
     FEW,
@@ -154,40 +155,46 @@ def too_few_to_judge(num_cameras: int) -> Iterator[Reason]:
 def judge_graph(placement: Judged) -> ModelVerdict:
     """Return the verdict on a placed graph, which has no observations."""
     level, assessment, reasons = placement.assessment.level_deg, placement.assessment, list[Reason]()
-    count, extent = len(placement.cameras), _extent(placement.locations)
-    unheld = int(np.sum(largest_sigmas(placement) > FEW * extent))
+    graph, agrees, count = placement.measured_part().graph, placement.agreement.agrees, len(placement.cameras)
+    edges, extent = graph.edges[agrees], max(_extent(placement.locations), float(np.finfo(float).tiny))
+    shares = largest_sigmas(placement) / extent
+    is_barely_held = barely_held(count, edges, graph.directions[agrees])
     if level > MOST_LEVEL_DEG:
         clause = f"the directions are {level:.0f} degrees off the cameras"
         reasons.append(Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE))
-    elif unheld > HALF * count:
-        clause = f"{unheld} of {counted(count, 'camera')} are uncertain by more than {FEW:.0%} of the extent"
+    elif np.mean(shares > FEW) > HALF or (np.mean(shares > RARE) > FEW and np.mean(is_barely_held) > MANY):
+        some = f"{np.sum(shares > RARE)} of {counted(count, 'camera')}"
+        clause = f"the pairs that agree leave {some} uncertain by more than {RARE:.0%} of the extent"
         reasons.append(Reason(kind=Kind.UNCERTAIN, sentence=clause, grade=Grade.DO_NOT_USE))
     if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
         clause = "no pair is checked by others"
         reasons.append(Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED))
-    return judge_model(placement, Shares(), reasons, _few_ties(placement))
+    names = [graph.name_of(k) for k in range(count)]
+    few_ties = _few_ties(find_few_ties(count, edges), is_barely_held, shares, names)
+    return judge_model(placement, Shares(), reasons, few_ties)
 
 
-def _few_ties(placement: Judged) -> Iterator[Reason]:
-    """Yield which cameras of a graph few agreeing pairs tie to the rest, and how well these are known."""
-    graph, agrees = placement.measured_part().graph, placement.agreement.agrees
-    edges, count = graph.edges[agrees], graph.num_nodes
-    shares = largest_sigmas(placement) / _extent(placement.locations)
-    for few in find_few_ties(count, edges):
-        some = f"{counted(few.num_pairs, 'agreeing pair')} {'ties' if few.num_pairs == 1 else 'tie'}"
-        clause = f"only {some} {len(few.cameras)} cameras to the rest, {_known_to(shares[few.cameras])}"
-        names = tuple(map(graph.name_of, few.cameras.tolist()))
-        yield Reason(kind=Kind.UNCHECKED, sentence=clause, images=names)
-    for k in np.flatnonzero(barely_held(count, edges, graph.directions[agrees])).tolist():
+def _few_ties(
+    parts: Iterable[FewTies], is_barely_held: BoolArray, shares: FloatArray, names: Sequence[str]
+) -> Iterator[Reason]:
+    """Yield which cameras few agreeing pairs tie to the rest; uncertainties are `shares` of the extent."""
+    for part in parts:
+        some = f"{counted(part.num_pairs, 'agreeing pair')} {'ties' if part.num_pairs == 1 else 'tie'}"
+        clause = f"only {some} {len(part.cameras)} cameras to the rest, {_known_to(shares[part.cameras])}"
+        images = tuple(names[k] for k in part.cameras.tolist())
+        yield Reason(kind=Kind.UNCHECKED, sentence=clause, images=images)
+    for k in np.flatnonzero(is_barely_held).tolist():
         clause = f"fewer than three of its agreeing pairs differ in direction, {_known_to(shares[[k]])}"
-        yield from of_each(Kind.UNCHECKED, [graph.name_of(k)], clause)
+        yield from of_each(Kind.UNCHECKED, [names[k]], clause)
 
 
 def _known_to(shares: FloatArray) -> str:
     """Say how well cameras of some standard deviations, which are shares of the extent, are placed."""
-    largest = float(shares.max())
+    largest, place = float(shares.max()), "so that its place" if len(shares) == 1 else "whose place"
+    if np.isnan(largest):
+        return f"{place} is not checked"
     known = f"known to ± {100.0 * largest:.2g} % of the extent" if largest < 1.0 else "not determined"
-    return f"so that its place is {known}" if len(shares) == 1 else f"whose place is {known}"
+    return f"{place} is {known}"
 
 
 def judge_model(

@@ -112,7 +112,7 @@ def test_a_straight_line_of_cameras_whose_spacing_nothing_holds_is_not_to_be_use
     pairs = np.array([(i, j) for i in range(40) for j in range(i + 1, min(i + 6, 40))])
     verdict = place(graph_of(centers, pairs, centers[pairs[:, 1]], rng)).verdict
     assert verdict.is_bad
-    assert "cameras are uncertain by more than 10% of the extent" in verdict.statement
+    assert "cameras uncertain by more than 5% of the extent" in verdict.statement
 
 
 def two_parts_and_one():
