@@ -1,8 +1,7 @@
 """`sfm-shapefit check MODEL`."""
 
 import shlex
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -77,6 +76,7 @@ def check_command(
         from sfm_shapefit.files.model_folder import refuse_no_model
 
         refuse_no_model(source)
+        from sfm_shapefit.base.atomic_folder import claimed_output
         from sfm_shapefit.files.colmap.database import find_database
         from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
@@ -96,7 +96,9 @@ def check_command(
                 read_source(source, database)  # what is wrong with that is said first
             refuse_file(report, overwrite=overwrite, protect=inputs)
         with (
-            _claimed(second_opinion, overwrite=overwrite, protect=inputs),
+            claimed_output(second_opinion, overwrite=overwrite, protect=inputs)
+            if second_opinion
+            else nullcontext(),
             show_progress(not (quiet or as_json)) as progress,
             hear_pycolmap(False),
         ):
@@ -113,13 +115,6 @@ def check_command(
             print_ending(found.verdict.grade.value, found.verdict.statement, written, told.step.command)
         if strict and not found.verdict.is_usable:
             raise typer.Exit(EXIT_UNSOLVABLE)
-
-
-def _claimed(out: Path | None, *, overwrite: bool, protect: Sequence[Path]) -> AbstractContextManager[None]:
-    """Return what holds the place of an output folder, if one is wanted."""
-    from sfm_shapefit.base.atomic_folder import claimed_output
-
-    return nullcontext() if out is None else claimed_output(out, overwrite=overwrite, protect=protect)
 
 
 def _keep_second(found: "CheckResult", out: Path | None, *, overwrite: bool) -> "CheckResult":

@@ -7,7 +7,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.facts.warnings import graph_warnings
-from sfm_shapefit.judgement.grade import judge_graph
+from sfm_shapefit.judgement.graph_grade import judge_graph
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.refinement.options import PlacementOptions

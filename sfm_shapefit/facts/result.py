@@ -56,7 +56,7 @@ from sfm_shapefit.judgement.grade import (
 )
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import FEW
-from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_each
+from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.support import ObservationShares
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -316,8 +316,8 @@ class LocateResult(_Placed):
             *weigh_evidence(self.evidence, self.placed),
         )
         repeats = tuple(match_warnings(self.directions))[:1]
-        repeated = (Reason(kind=Kind.REPEATED, sentence=sentence) for sentence in repeats)
-        lacks = () if self.model.num_points3D() else (Reason(kind=Kind.POINTS, sentence=NO_POINTS),)
+        repeated = (of_model(Kind.REPEATED, sentence) for sentence in repeats)
+        lacks = () if self.model.num_points3D() else (of_model(Kind.POINTS, NO_POINTS),)
         after = (*repeated, *self._off_priors(), *lacks, *self.suspicions)
         return judge_model(self.placement, shares, before, after).led_by(self.recognized)
 
@@ -327,7 +327,7 @@ class LocateResult(_Placed):
             wrong, count = len(self.prior_fit.wrong), int(np.isfinite(self.prior_fit.off).sum())
             if wrong > max(1, FEW * count):
                 clause = f"{wrong} of {counted(count, 'position prior')} contradict where cameras stand"
-                yield Reason(kind=Kind.INPUT, sentence=clause)
+                yield of_model(Kind.INPUT, clause)
 
     @property
     def database(self) -> Path | None:

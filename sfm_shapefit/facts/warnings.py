@@ -14,7 +14,7 @@ from sfm_shapefit.judgement.grade import largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import RARE
 from sfm_shapefit.judgement.options import TrustOptions
-from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Kind, Reason
+from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Kind, Reason, of_model
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -57,7 +57,7 @@ def rotation_suspicions(turned_deg: FloatArray, sigma_deg: float) -> Iterator[Re
     typical = float(np.nanmedian(turned_deg)) / _MEDIAN_TURN if np.isfinite(turned_deg).any() else 0.0
     if typical > _GROSS * sigma_deg:
         clause = f"the rotations are {typical:.0f} degrees off, not {sigma_deg:g}: {IS_ITS_DATABASE}"
-        yield Reason(kind=Kind.INPUT, sentence=clause)
+        yield of_model(Kind.INPUT, clause)
 
 
 def quality_warnings(placement: Judged, options: PlacementOptions | None = None) -> Iterator[str]:

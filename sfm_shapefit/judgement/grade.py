@@ -4,10 +4,6 @@ Do not use, if any of these holds:
 
     the pairs that agree hold less than half of the cameras in one rigid piece, also with the points that fit,
     however many contradict
-    of a bare graph, the residuals of its directions have a level above 6 degrees; another placement explains
-    the pairs nearly as well, or triangles speak for most of the pairs that it rejects
-    (`placement.second_configuration`); most cameras are uncertain by more than a tenth of the extent; or a
-    tenth is uncertain, and more than a third has agreeing pairs of fewer than three directions (`few_ties`)
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than half of all images are in the output
@@ -19,8 +15,8 @@ Do not use, if any of these holds:
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
 placed but are not in the output, that are kept though their matches make no points, that many pairs
 contradict and no pixels confirm (`witnesses`), or that evidence which the fit did not use names: another
-place, a seam, a wrong lens; in a bare graph also those that few pairs tie to the rest (`few_ties`). Trust
-is not low where the pixels confirm a camera. Look also, though no camera can be named, if
+place, a seam, a wrong lens. Trust is not low where the pixels confirm a camera. Look also, though no camera
+can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade
     many rejected pairs agree on a second configuration
@@ -31,8 +27,8 @@ is not low where the pixels confirm a camera. Look also, though no camera can be
     the images can be arranged in two ways (`rotations.arrangements`), whichever was taken
 
 It cannot be judged, unless it is not to be used, if nothing checks it: it has two cameras only, or no pair
-says how two of them stand to each other, as where poses come without points and database; or, in a bare
-graph, no pair is checked by others.
+says how two of them stand to each other, as where poses come without points and database. Bare graphs have
+rules of their own besides (`graph_grade`).
 
 Otherwise the model is good. How many of the observations see a 3D point is told, and decides nothing: on
 thirteen real scenes with good rotations 53 to 99.8 % do (least of all those of facing cameras in a park, who
@@ -40,35 +36,30 @@ stand right to 0.5 % of the extent), and 45 to 100 % of the pairs agree. Wrong p
 do not make a model bad.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import distances_in_spreads
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.few_ties import FewTies, barely_held, find_few_ties
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import (
     FEW,
     HALF,
     INSIDE,
-    KNOWN_DEG,
     MANY,
     RARE,
     SMALLEST_SHAPE,
-    SURE_SIGMAS,
 )
-from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each
+from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
-from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
 
-MOST_LEVEL_DEG = SURE_SIGMAS * KNOWN_DEG  # degrees, level of agreeing residuals; see the header
 FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to be looked at
 
 
@@ -99,13 +90,13 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     if apart:
         clause = clause.format(f"{len(apart)} of {counted(count, 'camera')}")
         grade = Grade.DO_NOT_USE if len(set(apart) - confirmed) > FEW * count else Grade.LOOK
-        yield Reason(kind=Kind.APART, sentence=clause, images=names(apart), grade=grade)
+        yield of_model(Kind.APART, clause, grade, names(apart))
     if evidence.num_held is not None and evidence.num_held < HALF * count:
         clause = f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}"
-        yield Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE)
+        yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
     if len(named - confirmed) > MANY * count and len(named) > len(apart):
         clause = f"evidence speaks against {len(named)} of {counted(count, 'camera')}"
-        yield Reason(kind=Kind.PLACE, sentence=clause, grade=Grade.DO_NOT_USE)
+        yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
     elsewhere = "it stands elsewhere in the model that map made of the same database"
     wrong = [camera for camera in wrong if camera not in apart]
     yield from of_each(Kind.SECOND_OPINION, names(wrong), f"{elsewhere}, which pairs support")
@@ -113,20 +104,20 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     yield from of_each(Kind.PLACE, names(places), "pairs agree on another place of it")
     if lenses:
         clause = f"images contradict {counted(len(lenses), 'focal length')}"
-        yield Reason(kind=Kind.LENS, sentence=clause, images=names(through.tolist()))
+        yield of_model(Kind.LENS, clause, images=names(through.tolist()))
     for one in evidence.contradicted:
         clause = f"{one.num_against} of its {one.num_pairs} pairs contradict where it stands"
         yield from of_each(Kind.PAIRS, names([one.camera]), clause)
     unchecked = [k for group in evidence.untied for k in group.cameras.tolist() if k not in apart]
     if unchecked:
         clause = "nothing checks how groups of cameras stand to one another"
-        yield Reason(kind=Kind.UNCHECKED, sentence=clause, images=names(unchecked))
+        yield of_model(Kind.UNCHECKED, clause, images=names(unchecked))
     if second is not None:
         clause = "at least half as much speaks for another place or rotation of it"
         yield from of_each(Kind.SECOND_OPINION, names(second.ambiguous.tolist()), clause)
         if second.has_nothing_in_common:
             clause = "the model that map makes of the same database has another shape"
-            yield Reason(kind=Kind.APART, sentence=clause)
+            yield of_model(Kind.APART, clause)
 
 
 def _find_apart(evidence: ModelEvidence) -> tuple[list[int], str]:
@@ -137,11 +128,9 @@ def _find_apart(evidence: ModelEvidence) -> tuple[list[int], str]:
         groups = [g if second.has_most_alike(g) else np.setdiff1d(g, second.alike) for g in groups]
     if second is not None and len(second.wrong) > 1:
         groups.insert(0, second.wrong)
-    clause = (
-        "nothing says how {} stand to the rest"
-        if len(loose) == len(groups)
-        else "{} stand apart from the rest"
-    )
+    clause = "{} stand apart from the rest"
+    if len(loose) == len(groups):
+        clause = "nothing says how {} stand to the rest"
     return list(dict.fromkeys(camera for group in groups for camera in group.tolist())), clause
 
 
@@ -149,52 +138,7 @@ def too_few_to_judge(num_cameras: int) -> Iterator[Reason]:
     """Yield that nothing checks a model, if it has so few cameras."""
     if num_cameras < SMALLEST_SHAPE:
         clause = "it has two cameras only, so that nothing checks their poses and lenses"
-        yield Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED)
-
-
-def judge_graph(placement: Judged) -> ModelVerdict:
-    """Return the verdict on a placed graph, which has no observations."""
-    level, assessment, reasons = placement.assessment.level_deg, placement.assessment, list[Reason]()
-    graph, agrees, count = placement.measured_part().graph, placement.agreement.agrees, len(placement.cameras)
-    edges, extent = graph.edges[agrees], max(_extent(placement.locations), float(np.finfo(float).tiny))
-    shares = largest_sigmas(placement) / extent
-    is_barely_held = barely_held(count, edges, graph.directions[agrees])
-    if level > MOST_LEVEL_DEG:
-        clause = f"the directions are {level:.0f} degrees off the cameras"
-        reasons.append(Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE))
-    elif np.mean(shares > FEW) > HALF or (np.mean(shares > RARE) > FEW and np.mean(is_barely_held) > MANY):
-        some = f"{np.sum(shares > RARE)} of {counted(count, 'camera')}"
-        clause = f"the pairs that agree leave {some} uncertain by more than {RARE:.0%} of the extent"
-        reasons.append(Reason(kind=Kind.UNCERTAIN, sentence=clause, grade=Grade.DO_NOT_USE))
-    if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
-        clause = "no pair is checked by others"
-        reasons.append(Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED))
-    names = [graph.name_of(k) for k in range(count)]
-    few_ties = _few_ties(find_few_ties(count, edges), is_barely_held, shares, names)
-    return judge_model(placement, Shares(), reasons, few_ties)
-
-
-def _few_ties(
-    parts: Iterable[FewTies], is_barely_held: BoolArray, shares: FloatArray, names: Sequence[str]
-) -> Iterator[Reason]:
-    """Yield which cameras few agreeing pairs tie to the rest; uncertainties are `shares` of the extent."""
-    for part in parts:
-        some = f"{counted(part.num_pairs, 'agreeing pair')} {'ties' if part.num_pairs == 1 else 'tie'}"
-        clause = f"only {some} {len(part.cameras)} cameras to the rest, {_known_to(shares[part.cameras])}"
-        images = tuple(names[k] for k in part.cameras.tolist())
-        yield Reason(kind=Kind.UNCHECKED, sentence=clause, images=images)
-    for k in np.flatnonzero(is_barely_held).tolist():
-        clause = f"fewer than three of its agreeing pairs differ in direction, {_known_to(shares[[k]])}"
-        yield from of_each(Kind.UNCHECKED, [names[k]], clause)
-
-
-def _known_to(shares: FloatArray) -> str:
-    """Say how well cameras of some standard deviations, which are shares of the extent, are placed."""
-    largest, place = float(shares.max()), "so that its place" if len(shares) == 1 else "whose place"
-    if np.isnan(largest):
-        return f"{place} is not checked"
-    known = f"known to ± {100.0 * largest:.2g} % of the extent" if largest < 1.0 else "not determined"
-    return f"{place} is {known}"
+        yield of_model(Kind.UNCHECKED, clause, Grade.CANNOT_BE_JUDGED)
 
 
 def judge_model(
@@ -208,69 +152,59 @@ def judge_model(
         before: what else speaks against the model, whose cameras are named first.
         after: the same, named last.
     """
-    return ModelVerdict.weigh(
-        [
-            *_reasons_against(shares),
-            *before,
-            *_doubtful_cameras(placement),
-            *after,
-            *_reasons_to_look(placement, shares),
-        ]
-    )
+    doubted = *before, *_doubtful_cameras(placement), *after
+    if (second := placement.second_configuration) is not None:
+        grade = Grade.DO_NOT_USE if second.is_as_good else Grade.LOOK
+        doubted = *doubted, of_model(Kind.REPEATED, second.clause, grade)
+    return ModelVerdict.weigh([*doubted, *_weigh_shares(shares)])
 
 
 def _doubtful_cameras(placement: Judged) -> Iterator[Reason]:
     """Yield what speaks against each camera by its trust, its uncertainty and how loose it hangs."""
     trust, reasons = placement.assessment.trust, placement.assessment.reasons
-    found = {
-        k: (Kind.TRUST, reasons[k] or "pairs speak against it")
-        for k in np.flatnonzero(trust < LOW_TRUST).tolist()
-    }
-    uncertain = Kind.UNCERTAIN, f"it is uncertain by more than {RARE:.0%} of the extent"
-    found = dict.fromkeys(uncertain_cameras(placement).tolist(), uncertain) | found
-    adjusted = placement.adjusted_covariances
+    found = dict[int, tuple[Kind, str]]()
     for group in placement.assessment.loose_groups:  # by the pairs; where the pixels were asked, they say
+        adjusted = placement.adjusted_covariances
         if adjusted is None or np.isnan(adjusted[group.cameras]).any():
-            loose = dict.fromkeys(group.cameras.tolist(), (Kind.UNCERTAIN, str(group.cause.value)))
-            found = loose | found
+            found |= dict.fromkeys(group.cameras.tolist(), (Kind.UNCERTAIN, str(group.cause.value)))
+    uncertain = Kind.UNCERTAIN, f"it is uncertain by more than {RARE:.0%} of the extent"
+    found |= dict.fromkeys(uncertain_cameras(placement).tolist(), uncertain)
+    low = np.flatnonzero(trust < LOW_TRUST).tolist()
+    found |= {k: (Kind.TRUST, reasons[k] or "pairs speak against it") for k in low}
     for k in sorted(found, key=lambda k: (trust[k], k)):
         kind, clause = found[k]
         yield from of_each(kind, [placement.graph.name_of(int(placement.cameras[k]))], clause)
 
 
-def _reasons_to_look(placement: Judged, shares: Shares) -> Iterator[Reason]:
-    """Yield why a model is to be looked at as a whole."""
-    second = placement.second_configuration
-    if second is not None:
-        grade = Grade.DO_NOT_USE if second.is_as_good else Grade.LOOK
-        yield Reason(kind=Kind.REPEATED, sentence=second.clause, grade=grade)
-    if shares.placed < FEW_PLACED:
-        yield Reason(kind=Kind.LEFT_OUT, sentence=f"only {shares.placed:.0%} of the images are placed")
-    elif shares.here < FEW_PLACED:
-        yield in_another_model(shares.here)
-
-
 def in_another_model(here: float) -> Reason:
     """Say that a model has only a share of the images that stand in some model."""
-    clause = f"{1.0 - here:.0%} of the images stand in another model"
-    return Reason(kind=Kind.LEFT_OUT, sentence=clause)
+    return of_model(Kind.LEFT_OUT, f"{1.0 - here:.0%} of the images stand in another model")
 
 
-def _reasons_against(shares: Shares) -> Iterator[Reason]:
-    """Yield why a model should not be used; a share that is not known is no reason."""
+def _weigh_shares(shares: Shares) -> Iterator[Reason]:
+    """Yield what too small or too large a share says against a model; one that is not known says nothing."""
     if shares.contradicting >= HALF:
         clause = f"{shares.contradicting:.0%} of the observations contradict the cameras"
-        yield Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE)
-    if shares.placed < HALF:
-        clause = f"only {shares.placed:.0%} of the images are placed"
-        yield Reason(kind=Kind.LEFT_OUT, sentence=clause, grade=Grade.DO_NOT_USE)
+        yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
+    if shares.placed < FEW_PLACED:
+        grade = Grade.DO_NOT_USE if shares.placed < HALF else Grade.LOOK
+        yield of_model(Kind.LEFT_OUT, f"only {shares.placed:.0%} of the images are placed", grade)
+    elif shares.here < FEW_PLACED:
+        yield in_another_model(shares.here)
 
 
 def uncertain_cameras(placement: Judged) -> IntArray:
     """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
     if len(placement.cameras) < SMALLEST_PIECE:
         return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(largest_sigmas(placement) > RARE * _extent(placement.locations))
+    return np.flatnonzero(sigmas_of_extent(placement) > RARE)
+
+
+def sigmas_of_extent(placement: Judged) -> FloatArray:
+    """Return the same as `largest_sigmas` as shares of the extent."""
+    extent = max(_extent(placement.locations), float(np.finfo(float).tiny))
+    with np.errstate(over="ignore"):  # where all stand in one place
+        return np.asarray(largest_sigmas(placement) / extent)
 
 
 def largest_sigmas(placement: Judged) -> FloatArray:

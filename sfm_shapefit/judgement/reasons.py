@@ -27,32 +27,19 @@ class Grade(enum.StrEnum):
 class Kind(enum.StrEnum):
     """What a reason is about."""
 
-    APART = "apart"
-    """A group stands apart from the rest."""
-    PLACE = "place"
-    """A camera may stand elsewhere."""
-    LENS = "lens"
-    """A lens is wrong, or cannot be."""
-    UNCHECKED = "unchecked"
-    """Nothing says, or checks, how cameras stand to one another."""
-    UNCERTAIN = "uncertain"
-    """A position, or the shape, is not determined well."""
-    TRUST = "trust"
-    """Pairs speak against a camera, or leave it loose."""
-    POINTS = "points"
-    """The points that a camera sees are few, or do not fit, or there are none."""
-    SECOND_OPINION = "second opinion"
-    """A model that `map` made of the same database has a camera elsewhere, or doubts it too."""
-    PAIRS = "pairs"
-    """Pairs or observations contradict a camera, or the model as a whole."""
-    REPEATED = "repeated structure"
-    """The scene may repeat itself."""
-    LEFT_OUT = "left out"
-    """Images are not in the model."""
-    INPUT = "input"
-    """The input is not what it was taken for: its database, convention, resolution, rotations or priors."""
-    FAILED = "failed"
-    """A step failed."""
+    APART = "apart"  # a group stands apart from the rest
+    PLACE = "place"  # a camera may stand elsewhere
+    LENS = "lens"  # a lens is wrong, or cannot be
+    UNCHECKED = "unchecked"  # nothing says, or checks, how cameras stand to one another
+    UNCERTAIN = "uncertain"  # a position, or the shape, is not determined well
+    TRUST = "trust"  # pairs speak against a camera, or leave it loose
+    POINTS = "points"  # the points that a camera sees are few, or do not fit, or there are none
+    SECOND_OPINION = "second opinion"  # the model of `map` has a camera elsewhere, or doubts it too
+    PAIRS = "pairs"  # pairs or observations contradict a camera, or the model as a whole
+    REPEATED = "repeated structure"  # the scene may repeat itself
+    LEFT_OUT = "left out"  # images are not in the model
+    INPUT = "input"  # its database, convention, resolution, rotations or priors are not what they seem
+    FAILED = "failed"  # a step failed
 
 
 class Reason(Record):
@@ -117,13 +104,17 @@ class ModelVerdict(Record):
             return "good"
         if self.grade is not Grade.LOOK:
             return f"{self.grade.value}: {'; '.join(self.reasons)}"
-        findings = (one for one in self.findings if one.kind is Kind.LEFT_OUT)
-        left_out = [name for one in findings for name in one.images]
+        left_out = [name for one in self.findings if one.kind is Kind.LEFT_OUT for name in one.images]
         there = [name for name in self.cameras if name not in left_out]
         what = f"look at {counted(len(there), 'camera')} ({first_of(there)})" if there else ""
         gone = f"{counted_are(len(left_out), 'image')} left out ({first_of(left_out)})" if left_out else ""
         said = "; ".join(filter(None, [what, gone, *self.reasons]))
         return said if there else f"{self.grade.value}: {said}"
+
+
+def of_model(kind: Kind, sentence: str, grade: Grade = Grade.LOOK, images: Sequence[str] = ()) -> Reason:
+    """Return a reason about the model as a whole."""
+    return Reason(kind=kind, sentence=sentence, images=tuple(images), grade=grade)
 
 
 def of_each(kind: Kind, images: Sequence[str], sentence: str) -> tuple[Reason, ...]:

@@ -38,7 +38,15 @@ from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
 from sfm_shapefit.judgement.grade import too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
-from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Grade, Kind, ModelVerdict, Reason, of_each
+from sfm_shapefit.judgement.reasons import (
+    IS_ITS_DATABASE,
+    Grade,
+    Kind,
+    ModelVerdict,
+    Reason,
+    of_each,
+    of_model,
+)
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -138,7 +146,7 @@ def check_source(
     recognized = recognize_resolution(*structure[:3])
     if verdict.is_bad and recognized is None:
         recognized = ask_convention(matches, clock.threads)
-    verdict = verdict.led_by(recognized and Reason(kind=Kind.INPUT, sentence=recognized.sentence))
+    verdict = verdict.led_by(recognized and of_model(Kind.INPUT, recognized.sentence))
     more = (one for one in reasons if one.of_each and one not in weak and one.kind is not Kind.SECOND_OPINION)
     cameras = _tell_cameras(model, pairs, [*weak, *more])
     told = tell_evidence(evidence, model.images)
@@ -239,13 +247,13 @@ def _reasons(
     centers = model.images.centers
     if np.ptp(centers, axis=0).max() <= _ROUNDING * np.abs(centers).max():
         clause = "all its cameras stand at the same place; place them with sfm-shapefit locate"
-        yield Reason(kind=Kind.PLACE, sentence=clause, grade=Grade.DO_NOT_USE)
+        yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
         return
     if fits is None or not (fits.contradicts.any() or np.isfinite(fits.residuals_deg).any()):
         is_bare = pointless and not matches.inputs.database
         clause = "no two of its images have matches that say how they stand to each other"
         clause = "it has no 3D points, and no database was given or found" if is_bare else clause
-        yield Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED)
+        yield of_model(Kind.UNCHECKED, clause, Grade.CANNOT_BE_JUDGED)
     yield from too_few_to_judge(model.images.num_images)
     against = list(weigh_evidence(evidence, model.images))
     yield from against
@@ -256,10 +264,10 @@ def _reasons(
     yield from (one for one in weak if not right.issuperset(one.images))
     if pointless:
         clause = "it has no 3D points, so that only matches say where its cameras stand"
-        yield Reason(kind=Kind.POINTS, sentence=clause)
+        yield of_model(Kind.POINTS, clause)
     if num_missing := len(matches.matches.missing_names):
         clause = f"the database lacks {counted(num_missing, 'image')}: {IS_ITS_DATABASE}"
-        yield Reason(kind=Kind.INPUT, sentence=clause)
+        yield of_model(Kind.INPUT, clause)
 
 
 def _strange_pairs(fits: PairFits, *, has_database: bool) -> Iterator[Reason]:
@@ -268,7 +276,7 @@ def _strange_pairs(fits: PairFits, *, has_database: bool) -> Iterator[Reason]:
         count = int(fits.contradicts.sum())
         clause = f"{counted(count, 'pair')} contradict{'s' * (count == 1)} it and none agrees"
         clause += f": {IS_ITS_DATABASE}" * has_database
-        yield Reason(kind=Kind.INPUT, sentence=clause, grade=Grade.DO_NOT_USE)
+        yield of_model(Kind.INPUT, clause, Grade.DO_NOT_USE)
 
 
 def _tell(

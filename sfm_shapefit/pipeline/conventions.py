@@ -13,7 +13,7 @@ from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.conventions import PoseFile, Recognized, recognize_convention
-from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Grade, Kind, Reason
+from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Grade, Kind, of_model
 from sfm_shapefit.judgement.resolutions import recognize_resolution, recognize_sizes
 from sfm_shapefit.pipeline.doubts import ask_rotations, rank_within
 from sfm_shapefit.pipeline.inputs import MatchSource
@@ -88,5 +88,5 @@ def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> L
     others = tuple(one for one in found.suspicions if not one.sentence.endswith(IS_ITS_DATABASE))
     first = recognized.sentence + ("; other warnings may come of that" if found.warnings else "")
     warnings = (first, *found.warnings)
-    reason = Reason(kind=Kind.INPUT, sentence=recognized.clause)
+    reason = of_model(Kind.INPUT, recognized.clause)
     return replace(found, recognized=reason, suspicions=others, warnings=warnings)

@@ -7,7 +7,8 @@ import pytest
 
 from sfm_shapefit import synthetic
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.grade import judge_graph, weigh_evidence
+from sfm_shapefit.judgement.grade import weigh_evidence
+from sfm_shapefit.judgement.graph_grade import judge_graph
 from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam

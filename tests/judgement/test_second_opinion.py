@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.judgement.evidence import Contradicted, ModelEvidence, fit_pairs
+from sfm_shapefit.judgement.evidence import Contradicted, ModelEvidence, SecondOpinion, fit_pairs
 from sfm_shapefit.judgement.grade import weigh_evidence
 from sfm_shapefit.judgement.places import OtherPlace
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.ties import Untied
@@ -99,6 +100,10 @@ def test_what_it_clears_is_not_told(images):
     named = {name for one in reasons for name in one.images}
     assert named == {images.names[k] for k in (0, 5, 6, 7, 8, 9)}  # three are doubted there
     assert f"4 of {N} cameras stand apart from the rest" in [one.sentence for one in reasons]
+    good = evidence.beside(second._replace(grade=Grade.GOOD), contradicting)
+    assert [group.cameras.tolist() for group in good.seams] == [
+        [5, 6]
+    ]  # who stands as in a good model is right
     neither = evidence.beside(second._replace(wrong=second.wrong[:0]), contradicting)
     assert (neither.seams, neither.untied) == (evidence.seams, evidence.untied)
 
@@ -121,3 +126,13 @@ def test_where_pairs_support_neither_nobody_is_believed(images):
 def test_without_cameras_in_common_there_is_no_opinion(images):
     others = replace(images, names=tuple(f"other-{name}" for name in images.names))
     assert compare(images, others, images) is None
+
+
+def test_of_a_group_those_are_named_whom_the_second_opinion_names(images):
+    """Pairs support neither of two places of 5 and 6; 4 stands alike in both."""
+    none = np.zeros(0, dtype=np.int64)
+    alike = np.setdiff1d(np.arange(N), [5, 6])
+    second = SecondOpinion(N, 0.001, none, np.array([5, 6]), alike, 0, 0, none)
+    evidence = ModelEvidence(seams=(Seam(np.array([4, 5, 6]), 1, 9, 0, np.nan),), second=second)
+    named = {name for one in weigh_evidence(evidence, images) for name in one.images}
+    assert named == {images.names[k] for k in (5, 6)}
