@@ -1,4 +1,4 @@
-"""The verdict on a bare view graph, by the rules of `grade` and those here: nothing but its directions speaks.
+"""The verdict on a bare view graph, of which nothing but directions speaks; the rules of `grade` hold too.
 
 Do not use, if any of these holds:
 
