@@ -6,9 +6,9 @@ Do not use, if any of these holds:
     another placement explains the pairs nearly as well, or triangles speak for most of the pairs that it
     rejects (`placement.second_configuration`)
     most cameras are uncertain by more than a tenth of the extent
-    more than a third of the cameras has agreeing pairs of fewer than three directions, and a tenth of them is
-    uncertain: of 300 cameras along crossing streets, half of whose pairs are wrong, 23 % or fewer were held
-    so badly where the median error was below 1 % of the extent, and 39 % or more where it was 4 % or more
+    more than a third of the cameras has agreeing pairs of fewer than three directions, and a tenth of all is
+    uncertain: along crossing streets of 300 cameras, 27 % or fewer are held so badly where the median error
+    is below 1 % of the extent, and 30 to 41 % where it is above 3 %
 
 Look at the cameras that few pairs tie to the rest (`few_ties`). It cannot be judged if no pair is checked by
 others.
