@@ -105,7 +105,36 @@ class _Residuals(NamedTuple):
     locations: FloatArray
     lengths: FloatArray  # (m,) floored
     units: FloatArray  # (m, d) directions of the baselines
-    errors: FloatArray  # (m, d - 1) along the axes of the covariances, radians
+    across: FloatArray  # (m, d, d - 1) axes of the covariances, less what of them is along the baselines
+    errors: FloatArray  # (m, d - 1) along these axes, radians
+
+
+class _Densities(NamedTuple):
+    """The densities of errors at each noise level, in units of that of a wrong direction."""
+
+    values: FloatArray  # (m, L) at the highest L levels; at lower ones all are 0
+    levels2: FloatArray  # (L,) squared levels, rad^2
+    own: FloatArray  # (m, d - 1) variances of the directions themselves, rad^2
+
+    def total(self, shares: FloatArray) -> FloatArray:
+        """Return the density of each error under the whole mixture of shares (K + 1,), (m,)."""
+        return np.asarray(self.values @ shares[-len(self.levels2) :] + shares[0])
+
+    def posteriors(self, shares: FloatArray) -> FloatArray:
+        """Return how many directions each share has by their posteriors, (K + 1,)."""
+        inverse, count, sums = 1.0 / self.total(shares), len(self.levels2), np.zeros_like(shares)
+        sums[0], sums[-count:] = shares[0] * inverse.sum(), shares[-count:] * (inverse @ self.values)
+        return sums
+
+    def information(self, shares: FloatArray) -> FloatArray:
+        """Return the information per axis that the posteriors of the levels give, (m, d - 1)."""
+        weights, inverse = shares[-len(self.levels2) :], 1.0 / self.total(shares)[:, None]
+        if not self.own.any():
+            return np.repeat(
+                (self.values @ (weights / self.levels2))[:, None] * inverse, self.own.shape[1], 1
+            )
+        spread = 1.0 / (self.own[:, :, None] + self.levels2)
+        return np.asarray(np.einsum("ek,eak->ea", self.values * weights, spread) * inverse)
 
 
 class _Noise(NamedTuple):
@@ -172,10 +201,11 @@ class Mixture:
         at, shares, bound = self._residuals(end.locations), noisier.shares, -np.inf
         variances = np.zeros_like(self._own)
         for _ in range(_WEIGH_ROUNDS):
-            wrong = self._expect(at.errors**2 + variances, shares, 0.0)[2][0] / len(self._own)
+            densities = self._densities(at.errors**2 + variances, 0.0)
+            wrong = densities.posteriors(shares)[0] / len(self._own)
             shares = np.r_[wrong, (1.0 - wrong) / noisier.right_share * noisier.shares[1:]]
             noise = _Noise(shares, 0.0, variances, self._precision(at.lengths))
-            system = self._equations(at, noise)
+            system = self._equations(at, noise, densities)
             if not self._refactor(system, _DAMPING[1]):
                 return -np.inf
             bound, variances = self._log_determinant(system, noise) - system.cost, self._propagate(at)
@@ -185,9 +215,10 @@ class Mixture:
         at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
         for _ in range(_MOST_STEPS):
-            shares = self._fit(at.errors**2 + variances, shares, floor)
+            densities = self._densities(at.errors**2 + variances, floor)
+            shares = self._fit(densities, shares, floor)
             noise = _Noise(shares, floor, variances, self._precision(at.lengths))
-            system = self._equations(at, noise)
+            system = self._equations(at, noise, densities)
             moved, damping = self._step(at, noise, system, damping)
             if moved is None:
                 break
@@ -241,28 +272,29 @@ class Mixture:
         floored = np.maximum(lengths / unit, _SHORTEST)
         units = baselines / (unit * floored)[:, None]
         angles = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(units - v, axis=1), 1.0))
-        errors = np.einsum("edk,ed->ek", self._axes, units)
+        along = np.einsum("edk,ed->ek", self._axes, units)
+        errors = along.copy()
         sines = np.linalg.norm(errors, axis=1)
         # Scaled to the angle, beyond 90 degrees too; straight behind, any axis will do.
         behind = sines <= np.finfo(float).tiny
         errors[behind, 0], sines[behind] = 1.0, 1.0
         scaled = np.asarray((t - t.mean(axis=0)) / unit)
-        return _Residuals(scaled, floored, units, errors * (angles / sines)[:, None])
+        across = self._axes - units[:, :, None] * along[:, None, :]
+        return _Residuals(scaled, floored, units, across, errors * (angles / sines)[:, None])
 
-    def _expect(
-        self, expected: FloatArray, shares: FloatArray, floor: float, own: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return information per axis (m, d - 1), log likelihood (m,), sums of the posteriors (K + 1,)."""
-        information, likelihood = np.empty_like(expected), np.empty(len(expected))
-        sums, weights = np.zeros_like(shares), shares * np.r_[1.0, np.full(len(_LEVELS_RAD), self._peak)]
-        levels = np.maximum(_LEVELS_RAD, floor)
-        _expect(expected, self._own if own is None else own, levels**2, weights, (information, likelihood, sums))
-        return information, likelihood, sums
+    def _densities(self, expected: FloatArray, floor: float, own: FloatArray | None = None) -> _Densities:
+        """Return the densities of squared errors expected along the axes, (m, d - 1)."""
+        own = self._own if own is None else own
+        first = max(int(np.searchsorted(_LEVELS_RAD, floor, side="right")) - 1, 0)
+        levels2 = np.maximum(_LEVELS_RAD[first:], floor) ** 2
+        values = np.zeros((len(expected), len(levels2)))
+        lowest = min(_write_densities(expected, own, levels2, self._peak, values), len(levels2) - 1)
+        return _Densities(values[:, lowest:], levels2[lowest:], own)
 
-    def _fit(self, expected: FloatArray, shares: FloatArray, floor: float) -> FloatArray:
+    def _fit(self, densities: _Densities, shares: FloatArray, floor: float) -> FloatArray:
         """Return the shares after some rounds of expectation maximization."""
         for _ in range(_FIT_ROUNDS):
-            last, shares = shares, _share_out(self._expect(expected, shares, floor)[2], floor)
+            last, shares = shares, _share_out(densities.posteriors(shares), floor)
             if np.abs(shares - last).max() <= _SETTLED:
                 break
         return shares
@@ -270,13 +302,15 @@ class Mixture:
     def _judge(self, at: _Residuals, noise: _Noise, bound: float) -> MixtureEnd:
         """Return locations with the posterior that each direction is right, and its variance if it is."""
         shares = noise.shares
-        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, shares, 0.0)
-        right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
+        densities = self._densities(at.errors**2 + noise.variances, 0.0)
+        right, information = 1.0 - shares[0] / densities.total(shares), densities.information(shares)
         variances = np.maximum(right, _TINY) / np.maximum(information.mean(axis=1), _TINY)
-        left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)  # of an error, without the pair
+        left = 1.0 - np.minimum(
+            information * noise.variances, _MOST_LEVERAGE
+        )  # of an error, without the pair
         alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
-        likelihood = self._expect((at.errors / left) ** 2, shares, 0.0, self._own + alone)[1]
-        right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
+        by_others = self._densities((at.errors / left) ** 2, 0.0, self._own + alone)
+        right = 1.0 - shares[0] / by_others.total(shares)
         return MixtureEnd(
             locations=at.locations,
             bound=bound,
@@ -291,30 +325,22 @@ class Mixture:
         return float(self._graph.num_nodes / len(logs) / tau**2)
 
     def _cost(self, at: _Residuals, noise: _Noise) -> float:
-        likelihood = self._expect(at.errors**2 + noise.variances, noise.shares, noise.floor)[1]
-        return _prior_cost(at.lengths, noise.precision) - float(likelihood.sum())
+        total = self._densities(at.errors**2 + noise.variances, noise.floor).total(noise.shares)
+        return _prior_cost(at.lengths, noise.precision) - float(np.log(total).sum())
 
-    def _equations(self, at: _Residuals, noise: _Noise) -> _System:
+    def _equations(self, at: _Residuals, noise: _Noise, densities: _Densities) -> _System:
         """Return the system of a step in the locations."""
-        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, noise.shares, noise.floor)
-        across, precision = self._across(at), noise.precision
-        along = at.units[:, :, None] * at.units[:, None, :]
-        blocks = (across * information[:, None, :]) @ across.transpose(0, 2, 1) + precision * along
-        blocks = blocks / at.lengths[:, None, None] ** 2
-        blocks += (_RIDGE * np.trace(blocks, axis1=1, axis2=2))[:, None, None] * np.eye(along.shape[1])
-        pull = np.einsum("edk,ek->ed", across, information * at.errors)
-        pull += (precision * _excess_logs(at.lengths))[:, None] * at.units
+        information, precision = densities.information(noise.shares), noise.precision
+        blocks, gradient = np.empty((len(at.lengths), *at.units.shape[1:] * 2)), np.empty_like(at.units)
+        excess = _excess_logs(at.lengths)
+        _assemble(at, information, precision, excess, blocks, gradient)
+        likelihood = float(np.log(densities.total(noise.shares)).sum())
         return _System(
             blocks=blocks,
-            gradient=pull / at.lengths[:, None],
+            gradient=gradient,
             damping_unit=float(np.median(information)) / at.lengths**2,
-            cost=_prior_cost(at.lengths, precision) - float(likelihood.sum()),
+            cost=_prior_cost(at.lengths, precision) - likelihood,
         )
-
-    def _across(self, at: _Residuals) -> FloatArray:
-        """Return the axes (m, d, d - 1) less what of them is along the baselines."""
-        along = np.einsum("edk,ed->ek", self._axes, at.units)
-        return np.asarray(self._axes - at.units[:, :, None] * along[:, None, :])
 
     def _refactor(self, system: _System, damping: float) -> bool:
         """Factor the damped normal matrix; return whether it is positive definite."""
@@ -334,11 +360,8 @@ class Mixture:
 
     def _propagate(self, at: _Residuals) -> FloatArray:
         """Return the variance of each residual by that of the locations, (m, d - 1), rad^2."""
-        i, j = self._graph.edges.T
-        inverse = selected_inverse(self._factor, self._graph.edges)
-        relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
-        across = self._across(at)
-        variances = np.sum(across * (relative @ across), axis=1) / at.lengths[:, None] ** 2
+        inverse, variances = selected_inverse(self._factor, self._graph.edges), np.empty_like(self._own)
+        _project(inverse.nodes, inverse.edges, self._graph.edges, at.across, at.lengths, variances)
         return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
 
     def _typical_level(self, end: MixtureEnd) -> float:
@@ -374,35 +397,59 @@ def _prior_cost(lengths: FloatArray, precision: float) -> float:
 
 
 @kernel
-def _expect(expected: Any, own: Any, levels2: Any, weights: Any, out: Any) -> None:
-    """Write the information per axis (m, k), the log likelihood (m,), and add up the posteriors (K + 1,).
+def _write_densities(expected: Any, own: Any, levels2: Any, peak: float, values: Any) -> int:
+    """Write the density (m, L) of each error at each level, and return the lowest level at which any counts.
 
-    `expected` (m, k) are mean squared errors along the axes of each direction, `levels2` ascending, `weights`
-    the shares, those of levels times the constant of the density, relative to that of wrong directions.
+    `expected` (m, k) are mean squared errors along the axes of each direction, `levels2` ascending; `peak` is
+    the constant of the density, relative to that of wrong directions. `values` are 0 before.
     """
-    information, likelihood, sums = out
     num_levels, num_axes = len(levels2), expected.shape[1]
-    terms = np.empty(num_levels)
+    least = num_levels
     for e in range(len(expected)):
-        total, density, lowest = weights[0], 0.0, 0
         for k in range(num_levels - 1, -1, -1):
-            if k == num_levels - 1 or levels2[k] != levels2[k + 1]:
-                exponent, spread = 0.0, 1.0
-                for a in range(num_axes):
-                    variance = levels2[k] + own[e, a]
-                    exponent += expected[e, a] / variance
-                    spread *= variance
-                if exponent > _NEGLIGIBLE:  # and more so at lower levels
-                    lowest = k + 1
-                    break
-                density = np.exp(-0.5 * exponent) / np.sqrt(spread)
-            terms[k] = weights[k + 1] * density
-            total += terms[k]
-        sums[0] += weights[0] / total
-        information[e] = 0.0
-        for k in range(lowest, num_levels):
-            share = terms[k] / total
-            sums[k + 1] += share
+            exponent, spread = 0.0, 1.0
             for a in range(num_axes):
-                information[e, a] += share / (levels2[k] + own[e, a])
-        likelihood[e] = np.log(total)
+                variance = levels2[k] + own[e, a]
+                exponent += expected[e, a] / variance
+                spread *= variance
+            if exponent > _NEGLIGIBLE:  # and more so at lower levels
+                break
+            values[e, k] = peak * np.exp(-0.5 * exponent) / np.sqrt(spread)
+            least = min(least, k)
+    return least
+
+
+@kernel
+def _assemble(at: Any, information: Any, precision: float, excess: Any, blocks: Any, gradient: Any) -> None:
+    """Write what each direction adds to the normal matrix (m, d, d) and to the gradient (m, d)."""
+    d = gradient.shape[1]
+    for e in range(len(gradient)):
+        scale, trace = 1.0 / at.lengths[e] ** 2, 0.0
+        for a in range(d):
+            pull = precision * excess[e] * at.units[e, a]
+            for q in range(d - 1):
+                pull += information[e, q] * at.errors[e, q] * at.across[e, a, q]
+            gradient[e, a] = pull / at.lengths[e]
+            for b in range(a + 1):
+                total = precision * at.units[e, a] * at.units[e, b]
+                for q in range(d - 1):
+                    total += information[e, q] * at.across[e, a, q] * at.across[e, b, q]
+                blocks[e, a, b] = blocks[e, b, a] = scale * total
+            trace += blocks[e, a, a]
+        for a in range(d):
+            blocks[e, a, a] += _RIDGE * trace
+
+
+@kernel
+def _project(nodes: Any, between: Any, edges: Any, across: Any, lengths: Any, variances: Any) -> None:
+    """Write the variances (m, d - 1) of the errors, by the covariances of the nodes and between both ends."""
+    d = nodes.shape[1]
+    for e in range(len(edges)):
+        i, j = edges[e]
+        for q in range(d - 1):
+            total = 0.0
+            for a in range(d):
+                for b in range(d):
+                    block = nodes[i, a, b] + nodes[j, a, b] - between[e, a, b] - between[e, b, a]
+                    total += across[e, a, q] * block * across[e, b, q]
+            variances[e, q] = total / lengths[e] ** 2
