@@ -48,15 +48,15 @@ from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.solver.program import adjoint, differences
 
-_LEVELS_RAD = np.geomspace(1e-7, 0.25, 22)
-"""Noise levels, radians, two of them a factor of 2 apart; noise below the first is none, beyond the last
+_LEVELS_RAD = np.geomspace(1e-7, 0.25, 43)
+"""Noise levels, radians, each 1.4 times the last; noise below the first is none, beyond the last
 nothing is known of a direction."""
 _LOG_LEVELS = np.log(_LEVELS_RAD)
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
 _NEXT_FLOOR = 2.0  # typical levels; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
-_SPREADS = (0.35, 1.3)  # standard deviation of log levels, least (half a step of the grid) and largest
+_SPREADS = (0.2, 1.3)  # standard deviation of log levels, least (half a step of the grid) and largest
 _PSEUDO_WRONG = 1.0  # pairs added to the wrong ones, whose share may not become 0
 _FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
@@ -72,6 +72,7 @@ _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most 
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
 _TYPICAL = 0.8  # share of the right pairs; the level that so many have at most serves a consensus
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
+_UNKNOWN = 1e-6  # probability of being right; a direction of less has the usual variance
 _MOST_LEVERAGE = 0.999  # share of a residual's variance; nothing but the pair holds such a camera
 _WEIGH_ROUNDS = 3  # of share and variances, at locations that stay
 _TINY = float(np.finfo(np.float64).tiny)
@@ -191,7 +192,7 @@ class Mixture:
 
     def lead(self, end: MixtureEnd, other: MixtureEnd) -> float:
         """Return by how many nats the bound of one end is above the other's, at the noise of the noisier."""
-        noisier = max(end, other, key=lambda found: float(found.shares[1:] @ _LOG_LEVELS) / found.right_share)
+        noisier = max(end, other, key=self._typical_level)
         return self._weigh(end, noisier) - self._weigh(other, noisier)
 
     def _weigh(self, end: MixtureEnd, noisier: MixtureEnd) -> float:
@@ -203,7 +204,7 @@ class Mixture:
         for _ in range(_WEIGH_ROUNDS):
             densities = self._densities(at.errors**2 + variances, 0.0)
             wrong = densities.posteriors(shares)[0] / len(self._own)
-            shares = np.r_[wrong, (1.0 - wrong) / noisier.right_share * noisier.shares[1:]]
+            shares = np.r_[wrong, (1.0 - wrong) / max(noisier.right_share, _TINY) * noisier.shares[1:]]
             noise = _Noise(shares, 0.0, variances, self._precision(at.lengths))
             system = self._equations(at, noise, densities)
             if not self._refactor(system, _DAMPING[1]):
@@ -304,10 +305,10 @@ class Mixture:
         shares = noise.shares
         densities = self._densities(at.errors**2 + noise.variances, 0.0)
         right, information = 1.0 - shares[0] / densities.total(shares), densities.information(shares)
-        variances = np.maximum(right, _TINY) / np.maximum(information.mean(axis=1), _TINY)
-        left = 1.0 - np.minimum(
-            information * noise.variances, _MOST_LEVERAGE
-        )  # of an error, without the pair
+        usual = np.exp(2.0 * (shares[1:] + _TINY) @ _LOG_LEVELS / (shares[1:] + _TINY).sum()) + self._own
+        variances = (right + _UNKNOWN) / (information + _UNKNOWN / usual).mean(axis=1)
+        # What an error would be without the pair's own pull.
+        left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)
         alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
         by_others = self._densities((at.errors / left) ** 2, 0.0, self._own + alone)
         right = 1.0 - shares[0] / by_others.total(shares)

@@ -60,10 +60,6 @@ _TIE = 1e-3  # relative difference of costs; a smaller one says nothing where th
 _POINT_LENGTH = 1e-6  # share of the mean length of all pairs; the cameras of a shorter one stand in one place
 _EXPLAINED = 0.9  # share of the pairs; an answer that explains fewer may be a fold, and triangles are asked
 _POORLY_EXPLAINED = 0.35  # share of the pairs; below, posteriors are followed from solve to solve, too
-_NO_MIXTURE = (
-    "; not by a mixture of noise levels: that takes a bare graph, refined, of ten cameras or more that move "
-    "one by one, each in several pairs"
-)
 OPENING_RAD = 0.1
 """Largest width of the kernel, in radians, at which unrefined starts are compared; see `angular`."""
 
@@ -193,14 +189,8 @@ def refine_starts(
     lud, second = _find_second_start(measured, options.solver.num_threads(), certified)
     apart = None if second is None else disagreement(graph, solved.locations, second)
     normal_solver = _plan_normal_solver(measured, options) if options.refines else None
-    problem, kept, note = _Problem(measured, normal_solver, solved.locations, second, apart), None, ""
-    if options.objective == "mixture":
-        options = replace(options, objective="auto")
-        kept = _find_most_evident(problem, options)
-        note = _NO_MIXTURE
-    if kept is None:
-        kept = _find_best_fit(problem, options)
-        kept = kept._replace(reason=kept.reason + note)
+    problem = _Problem(measured, normal_solver, solved.locations, second, apart)
+    kept = _find_most_evident(problem, options) or _find_best_fit(problem, options)
     moved = _measure_moves(kept.start)
     # To the bit: the certificate is that of these very locations.
     is_as_solved = kept.start.locations is solved.locations and moved[1] == 0.0
@@ -288,7 +278,9 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
     """Return the end of most evidence under a mixture of noise levels; None if the graph has no such end."""
     measured, plan = problem.measured, problem.normal_solver
     is_bare = measured.evidence is None and measured.num_points == 0
-    if not (is_bare and isinstance(plan, SymbolicFactor) and can_be_reweighted(measured)):
+    if options.objective != "auto" or not (
+        is_bare and isinstance(plan, SymbolicFactor) and can_be_reweighted(measured)
+    ):
         return None
     model = Mixture(measured, plan)
     candidates = _descend_from_starts(model, problem, options)
