@@ -48,35 +48,60 @@ from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.solver.program import adjoint, differences
 
-_LEVELS_RAD = np.geomspace(1e-7, 0.25, 43)
-"""Noise levels, radians, each 1.4 times the last; noise below the first is none, beyond the last
-nothing is known of a direction."""
-_LOG_LEVELS = np.log(_LEVELS_RAD)
+_LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
+_NODES = np.linspace(-4.0, 4.0, 13)  # standard scores of log levels, at which their normal density is summed
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
 _NEXT_FLOOR = 2.0  # typical levels; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
-_SPREADS = (0.2, 1.3)  # standard deviation of log levels, least (half a step of the grid) and largest
+_SPREADS = (0.05, 1.3)  # standard deviation of log levels, least and largest
 _PSEUDO_WRONG = 1.0  # pairs added to the wrong ones, whose share may not become 0
 _FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
-_LONGEST = 50.0  # median lengths; e^4, beyond what a spread of lengths of 2 allows for all pairs of a node
+_LONGEST = (
+    50.0  # median lengths, geometric mean of a node's pairs; beyond two of the largest spreads of lengths
+)
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
 _LEAST_GAIN = 0.5  # nats; a smaller change of the bound is none
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
-_TYPICAL = 0.8  # share of the right pairs; the level that so many have at most serves a consensus
+_TYPICAL = 0.84  # standard score of a log level; the level that four of five have at most
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
 _UNKNOWN = 1e-6  # probability of being right; a direction of less has the usual variance
-_MOST_LEVERAGE = 0.999  # share of a residual's variance; nothing but the pair holds such a camera
+_MOST_LEVERAGE = 0.9  # share of a residual's variance; nothing but the pair holds such a camera
 _WEIGH_ROUNDS = 3  # of share and variances, at locations that stay
 _TINY = float(np.finfo(np.float64).tiny)
 _LARGEST_VARIANCE = 1.0  # rad^2; a direction that nothing determines has no more
+_NODE_SHARES = np.exp(-0.5 * _NODES**2) / np.exp(-0.5 * _NODES**2).sum()
+
+
+class Levels(NamedTuple):
+    """Share and noise of right directions."""
+
+    right: float
+    """Share of the directions that are right."""
+    mean: float
+    """Mean of the log levels, in radians, of these."""
+    spread: float
+    """Their standard deviation."""
+
+    def at_nodes(self, floor: float) -> FloatArray:
+        """Return the levels (K,), radians, ascending, at which their density is summed; none below a floor."""
+        lowest, highest = _LEVELS_RAD
+        return np.clip(np.exp(self.mean + self.spread * _NODES), max(floor, lowest), highest)
+
+    @property
+    def typical(self) -> float:
+        """The level, radians, that four of five right directions have at most."""
+        return float(np.clip(np.exp(self.mean + _TYPICAL * self.spread), *_LEVELS_RAD))
+
+
+_FIRST_LEVELS = Levels(right=0.5, mean=float(np.log(_FIRST_FLOOR_RAD)), spread=1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,13 +116,13 @@ class MixtureEnd:
     """(m,) probability that each direction is right."""
     variances: FloatArray
     """(m,) variance per axis of the error of each direction if it is right, rad^2, own part included."""
-    shares: FloatArray
-    """(K + 1,) shares of wrong directions and of each level."""
+    levels: Levels
+    """Share and noise of the right directions."""
 
     @property
     def right_share(self) -> float:
         """Share of the directions that are right."""
-        return float(1.0 - self.shares[0])
+        return self.levels.right
 
 
 class _Residuals(NamedTuple):
@@ -110,38 +135,18 @@ class _Residuals(NamedTuple):
     errors: FloatArray  # (m, d - 1) along these axes, radians
 
 
-class _Densities(NamedTuple):
-    """The densities of errors at each noise level, in units of that of a wrong direction."""
+class _Expectation(NamedTuple):
+    """What the directions say, each by the posterior of its level."""
 
-    values: FloatArray  # (m, L) at the highest L levels; at lower ones all are 0
-    levels2: FloatArray  # (L,) squared levels, rad^2
-    own: FloatArray  # (m, d - 1) variances of the directions themselves, rad^2
-
-    def total(self, shares: FloatArray) -> FloatArray:
-        """Return the density of each error under the whole mixture of shares (K + 1,), (m,)."""
-        return np.asarray(self.values @ shares[-len(self.levels2) :] + shares[0])
-
-    def posteriors(self, shares: FloatArray) -> FloatArray:
-        """Return how many directions each share has by their posteriors, (K + 1,)."""
-        inverse, count, sums = 1.0 / self.total(shares), len(self.levels2), np.zeros_like(shares)
-        sums[0], sums[-count:] = shares[0] * inverse.sum(), shares[-count:] * (inverse @ self.values)
-        return sums
-
-    def information(self, shares: FloatArray) -> FloatArray:
-        """Return the information per axis that the posteriors of the levels give, (m, d - 1)."""
-        weights, inverse = shares[-len(self.levels2) :], 1.0 / self.total(shares)[:, None]
-        if not self.own.any():
-            return np.repeat(
-                (self.values @ (weights / self.levels2))[:, None] * inverse, self.own.shape[1], 1
-            )
-        spread = 1.0 / (self.own[:, :, None] + self.levels2)
-        return np.asarray(np.einsum("ek,eak->ea", self.values * weights, spread) * inverse)
+    information: FloatArray  # (m, d - 1) per axis, rad^-2
+    likelihood: FloatArray  # (m,) log, over that of a wrong direction
+    sums: FloatArray  # (K + 1,) of the posteriors: of being wrong, and of each level
 
 
 class _Noise(NamedTuple):
     """The model of one step."""
 
-    shares: FloatArray  # (K + 1,)
+    levels: Levels
     floor: float  # radians; lower levels count as this one
     variances: FloatArray  # (m, d - 1) rad^2, residuals by the locations
     precision: float  # 1 / variance of a log length in the prior
@@ -174,17 +179,15 @@ class Mixture:
 
     def descend(self, start: FloatArray) -> MixtureEnd | None:
         """Return where a descent from (n, d) locations ends; None if its equations are singular."""
-        count = len(_LEVELS_RAD)
-        return self._descend(start, _FIRST_FLOOR_RAD, np.r_[0.5, np.full(count, 0.5 / count)])
+        return self._descend(start, _FIRST_FLOOR_RAD, _FIRST_LEVELS)
 
     def improve(self, end: MixtureEnd) -> MixtureEnd:
         """Return the end of most evidence that consensus and descents, in turn, lead to."""
         for _ in range(_MOST_ROUNDS):
-            level = self._typical_level(end)
-            moved = self._put_by_consensus(end, level)
+            moved = self._put_by_consensus(end)
             if np.array_equal(moved, end.locations):
                 break
-            found = self._descend(moved, min(_NEXT_FLOOR * level, _FIRST_FLOOR_RAD), end.shares)
+            found = self._descend(moved, min(_NEXT_FLOOR * end.levels.typical, _FIRST_FLOOR_RAD), end.levels)
             if found is None or found.bound <= end.bound + _ROUND_GAIN:
                 break
             end = found
@@ -192,34 +195,31 @@ class Mixture:
 
     def lead(self, end: MixtureEnd, other: MixtureEnd) -> float:
         """Return by how many nats the bound of one end is above the other's, at the noise of the noisier."""
-        noisier = max(end, other, key=self._typical_level)
-        return self._weigh(end, noisier) - self._weigh(other, noisier)
+        noise = max(end.levels, other.levels, key=lambda levels: levels.typical)
+        return self._weigh(end, noise) - self._weigh(other, noise)
 
-    def _weigh(self, end: MixtureEnd, noisier: MixtureEnd) -> float:
-        """Return the bound at the locations of an end, with the levels of the right directions of another."""
-        if end is noisier:
+    def _weigh(self, end: MixtureEnd, levels: Levels) -> float:
+        """Return the bound at the locations of an end, where right directions have such levels."""
+        if end.levels is levels:
             return end.bound
-        at, shares, bound = self._residuals(end.locations), noisier.shares, -np.inf
-        variances = np.zeros_like(self._own)
+        at, bound, variances = self._residuals(end.locations), -np.inf, np.zeros_like(self._own)
         for _ in range(_WEIGH_ROUNDS):
-            densities = self._densities(at.errors**2 + variances, 0.0)
-            wrong = densities.posteriors(shares)[0] / len(self._own)
-            shares = np.r_[wrong, (1.0 - wrong) / max(noisier.right_share, _TINY) * noisier.shares[1:]]
-            noise = _Noise(shares, 0.0, variances, self._precision(at.lengths))
-            system = self._equations(at, noise, densities)
+            expected = at.errors**2 + variances
+            levels = levels._replace(right=_right_share(self._expect(expected, levels, 0.0).sums))
+            noise = _Noise(levels, 0.0, variances, self._precision(at.lengths))
+            system = self._equations(at, noise.precision, self._expect(expected, levels, 0.0))
             if not self._refactor(system, _DAMPING[1]):
                 return -np.inf
             bound, variances = self._log_determinant(system, noise) - system.cost, self._propagate(at)
         return bound
 
-    def _descend(self, start: FloatArray, floor: float, shares: FloatArray) -> MixtureEnd | None:
+    def _descend(self, start: FloatArray, floor: float, levels: Levels) -> MixtureEnd | None:
         at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
         for _ in range(_MOST_STEPS):
-            densities = self._densities(at.errors**2 + variances, floor)
-            shares = self._fit(densities, shares, floor)
-            noise = _Noise(shares, floor, variances, self._precision(at.lengths))
-            system = self._equations(at, noise, densities)
+            levels, found = self._fit(at.errors**2 + variances, levels, floor)
+            noise = _Noise(levels, floor, variances, self._precision(at.lengths))
+            system = self._equations(at, noise.precision, found)
             moved, damping = self._step(at, noise, system, damping)
             if moved is None:
                 break
@@ -228,25 +228,27 @@ class Mixture:
             if floor <= _NOISELESS_RAD and abs(bound - before) < _LEAST_GAIN:
                 break
             variances, at = self._propagate(at), moved  # the variance of a residual hardly moves in a step
-            floor = max(floor * _FALL, float(_LEVELS_RAD[0]))
+            floor = max(floor * _FALL, _LEVELS_RAD[0])
         return None if last is None else self._judge(*last)
 
-    def _draw_in(self, start: FloatArray) -> FloatArray:
-        """Return a start with the nodes all of whose pairs are very long amid their neighbors.
+    def _draw_in(self, t: FloatArray) -> FloatArray:
+        """Return locations with the nodes whose pairs are very long amid their neighbors.
 
         Nothing determines such a node, and at the scale of the others the prior of lengths hardly moves it.
         """
         edges, n = self._graph.edges, self._graph.num_nodes
-        lengths = np.linalg.norm(differences(start, edges), axis=1)
-        least = np.full(n, np.inf)
-        np.minimum.at(least, edges.ravel(), np.repeat(lengths, 2))
-        far = least > _LONGEST * np.median(lengths)
-        near, start = ~far[edges[:, ::-1]], start.copy()
-        sums, counts = np.zeros_like(start), np.bincount(edges[near], minlength=n)
-        np.add.at(sums, edges[near], start[edges[:, ::-1][near]])
+        lengths = np.linalg.norm(differences(t, edges), axis=1)
+        logs = np.log(np.maximum(lengths / max(float(np.median(lengths)), _TINY), _SHORTEST))
+        degrees = self._graph.degrees()
+        far = np.bincount(edges.ravel(), np.repeat(logs, 2), n) > np.log(_LONGEST) * degrees
+        if not far.any():
+            return t
+        others, ends = edges[:, ::-1][near := ~far[edges[:, ::-1]]], edges[near]
+        counts, t = np.bincount(ends, minlength=n), t.copy()
+        sums = np.stack([np.bincount(ends, x[others], n) for x in t.T], axis=1)
         far &= counts > 0
-        start[far] = sums[far] / counts[far, None]
-        return start
+        t[far] = sums[far] / counts[far, None]
+        return t
 
     def _step(
         self, at: _Residuals, noise: _Noise, system: _System, damping: float
@@ -258,7 +260,7 @@ class Mixture:
         right = -adjoint(system.gradient, self._graph.edges, self._graph.num_nodes)
         while damping <= _DAMPING[2]:
             if self._refactor(system, damping):
-                proposed = at.locations + self._factor.solve(right)
+                proposed = self._draw_in(at.locations + self._factor.solve(right))
                 there = self._residuals(proposed)
                 if self._cost(there, noise) < system.cost:
                     return there, max(damping / 10.0, _DAMPING[1])
@@ -283,41 +285,45 @@ class Mixture:
         across = self._axes - units[:, :, None] * along[:, None, :]
         return _Residuals(scaled, floored, units, across, errors * (angles / sines)[:, None])
 
-    def _densities(self, expected: FloatArray, floor: float, own: FloatArray | None = None) -> _Densities:
-        """Return the densities of squared errors expected along the axes, (m, d - 1)."""
-        own = self._own if own is None else own
-        first = max(int(np.searchsorted(_LEVELS_RAD, floor, side="right")) - 1, 0)
-        levels2 = np.maximum(_LEVELS_RAD[first:], floor) ** 2
-        values = np.zeros((len(expected), len(levels2)))
-        lowest = min(_write_densities(expected, own, levels2, self._peak, values), len(levels2) - 1)
-        return _Densities(values[:, lowest:], levels2[lowest:], own)
+    def _expect(
+        self, expected: FloatArray, levels: Levels, floor: float, own: FloatArray | None = None
+    ) -> _Expectation:
+        """Return what squared errors expected along the axes, (m, d - 1), say under some levels."""
+        information, likelihood = np.empty_like(expected), np.empty(len(expected))
+        weights = np.r_[1.0 - levels.right, levels.right * self._peak * _NODE_SHARES]
+        sums, levels2 = np.zeros_like(weights), levels.at_nodes(floor) ** 2
+        found = _Expectation(information, likelihood, sums)
+        _expect(expected, self._own if own is None else own, levels2, weights, found)
+        return found
 
-    def _fit(self, densities: _Densities, shares: FloatArray, floor: float) -> FloatArray:
-        """Return the shares after some rounds of expectation maximization."""
+    def _fit(self, expected: FloatArray, levels: Levels, floor: float) -> tuple[Levels, _Expectation]:
+        """Return the levels after rounds of expectation maximization, and what is expected under them."""
+        found = self._expect(expected, levels, floor)
         for _ in range(_FIT_ROUNDS):
-            last, shares = shares, _share_out(densities.posteriors(shares), floor)
-            if np.abs(shares - last).max() <= _SETTLED:
+            last, levels = levels, _maximize(found, expected, levels, floor)
+            found = self._expect(expected, levels, floor)
+            if np.abs(np.subtract(levels, last)).max() <= _SETTLED:
                 break
-        return shares
+        return levels, found
 
     def _judge(self, at: _Residuals, noise: _Noise, bound: float) -> MixtureEnd:
         """Return locations with the posterior that each direction is right, and its variance if it is."""
-        shares = noise.shares
-        densities = self._densities(at.errors**2 + noise.variances, 0.0)
-        right, information = 1.0 - shares[0] / densities.total(shares), densities.information(shares)
-        usual = np.exp(2.0 * (shares[1:] + _TINY) @ _LOG_LEVELS / (shares[1:] + _TINY).sum()) + self._own
+        levels = noise.levels
+        found = self._expect(at.errors**2 + noise.variances, levels, 0.0)
+        right, information = _posterior(levels, found.likelihood), found.information
+        usual = np.exp(2.0 * levels.mean) + self._own
         variances = (right + _UNKNOWN) / (information + _UNKNOWN / usual).mean(axis=1)
-        # What an error would be without the pair's own pull.
-        left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)
+        left = 1.0 - np.minimum(
+            information * noise.variances, _MOST_LEVERAGE
+        )  # of an error, without the pair
         alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
-        by_others = self._densities((at.errors / left) ** 2, 0.0, self._own + alone)
-        right = 1.0 - shares[0] / by_others.total(shares)
+        likelihood = self._expect((at.errors / left) ** 2, levels, 0.0, self._own + alone).likelihood
         return MixtureEnd(
             locations=at.locations,
             bound=bound,
-            posterior=right,
+            posterior=_posterior(levels, likelihood),
             variances=np.maximum(variances, _LEVELS_RAD[0] ** 2),
-            shares=shares,
+            levels=levels,
         )
 
     def _precision(self, lengths: FloatArray) -> float:
@@ -326,21 +332,19 @@ class Mixture:
         return float(self._graph.num_nodes / len(logs) / tau**2)
 
     def _cost(self, at: _Residuals, noise: _Noise) -> float:
-        total = self._densities(at.errors**2 + noise.variances, noise.floor).total(noise.shares)
-        return _prior_cost(at.lengths, noise.precision) - float(np.log(total).sum())
+        likelihood = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor).likelihood
+        return _prior_cost(at.lengths, noise.precision) - float(likelihood.sum())
 
-    def _equations(self, at: _Residuals, noise: _Noise, densities: _Densities) -> _System:
+    def _equations(self, at: _Residuals, precision: float, found: _Expectation) -> _System:
         """Return the system of a step in the locations."""
-        information, precision = densities.information(noise.shares), noise.precision
-        blocks, gradient = np.empty((len(at.lengths), *at.units.shape[1:] * 2)), np.empty_like(at.units)
-        excess = _excess_logs(at.lengths)
-        _assemble(at, information, precision, excess, blocks, gradient)
-        likelihood = float(np.log(densities.total(noise.shares)).sum())
+        m, d = at.units.shape
+        blocks, gradient = np.empty((m, d, d)), np.empty((m, d))
+        _assemble(at, found.information, precision, _excess_logs(at.lengths), blocks, gradient)
         return _System(
             blocks=blocks,
             gradient=gradient,
-            damping_unit=float(np.median(information)) / at.lengths**2,
-            cost=_prior_cost(at.lengths, precision) - likelihood,
+            damping_unit=float(np.median(found.information)) / at.lengths**2,
+            cost=_prior_cost(at.lengths, precision) - float(found.likelihood.sum()),
         )
 
     def _refactor(self, system: _System, damping: float) -> bool:
@@ -362,28 +366,36 @@ class Mixture:
     def _propagate(self, at: _Residuals) -> FloatArray:
         """Return the variance of each residual by that of the locations, (m, d - 1), rad^2."""
         inverse, variances = selected_inverse(self._factor, self._graph.edges), np.empty_like(self._own)
-        _project(inverse.nodes, inverse.edges, self._graph.edges, at.across, at.lengths, variances)
+        _project((inverse.nodes, inverse.edges), self._graph.edges, at.across, at.lengths, variances)
         return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
 
-    def _typical_level(self, end: MixtureEnd) -> float:
-        right = np.cumsum(end.shares[1:])
-        return float(_LEVELS_RAD[min(np.searchsorted(right, _TYPICAL * right[-1]), len(_LEVELS_RAD) - 1)])
-
-    def _put_by_consensus(self, end: MixtureEnd, level: float) -> FloatArray:
+    def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
         odds = np.full(len(self._own), logit(end.right_share))
-        return put_by_consensus(self._graph, end.locations, odds, level**2 + self._own.mean(axis=1))
+        return put_by_consensus(
+            self._graph, end.locations, odds, end.levels.typical**2 + self._own.mean(axis=1)
+        )
 
 
-def _share_out(sums: FloatArray, floor: float) -> FloatArray:
-    """Return the most likely shares (K + 1,) for sums of the posteriors; none below the floor."""
-    first = max(int(np.searchsorted(_LEVELS_RAD, floor, side="right")) - 1, 0)
-    logs, counts = np.log(np.maximum(_LEVELS_RAD[first:], floor)), sums[first + 1 :] + _TINY
-    mean = float(counts @ logs / counts.sum())
-    spread = np.clip(np.sqrt(counts @ (logs - mean) ** 2 / counts.sum()), *_SPREADS)
-    normal = np.exp(-0.5 * ((logs - mean) / spread) ** 2)
-    right, wrong = float(counts.sum()), float(sums[0]) + _PSEUDO_WRONG
-    shares = np.r_[wrong, np.zeros(first), right / normal.sum() * normal]
-    return np.asarray(shares / (right + wrong))
+def _maximize(found: _Expectation, expected: FloatArray, levels: Levels, floor: float) -> Levels:
+    """Return the most likely levels for what was expected under some."""
+    least, counts = np.log(max(floor, _LEVELS_RAD[0])), found.sums[1:] + _TINY
+    # The factor by which all levels together fit the errors, and the squares of the scores.
+    factor2 = np.vdot(found.information, expected) / (expected.shape[1] * counts.sum())
+    mean = np.clip(levels.mean + 0.5 * np.log(max(factor2, _TINY)), least, np.log(_LEVELS_RAD[1]))
+    gain = levels.spread**2 / (levels.spread**2 + 0.5 / expected.shape[1])
+    grown = 1.0 + (counts @ _NODES**2 / counts.sum() - 1.0) / gain
+    spread = np.clip(levels.spread * np.sqrt(max(grown, 0.0)), *_SPREADS)
+    return Levels(_right_share(found.sums), float(mean), float(spread))
+
+
+def _right_share(sums: FloatArray) -> float:
+    """Return the most likely share of right directions for sums of the posteriors (K + 1,)."""
+    return float(sums[1:].sum() / (sums.sum() + _PSEUDO_WRONG))
+
+
+def _posterior(levels: Levels, likelihood: FloatArray) -> FloatArray:
+    """Return the probability that each direction is right, from the log likelihood of the mixture (m,)."""
+    return np.asarray(-np.expm1(np.minimum(np.log1p(-levels.right) - likelihood, 0.0)))
 
 
 def _excess_logs(lengths: FloatArray) -> FloatArray:
@@ -398,26 +410,44 @@ def _prior_cost(lengths: FloatArray, precision: float) -> float:
 
 
 @kernel
-def _write_densities(expected: Any, own: Any, levels2: Any, peak: float, values: Any) -> int:
-    """Write the density (m, L) of each error at each level, and return the lowest level at which any counts.
+def _expect(expected: Any, own: Any, levels2: Any, weights: Any, found: Any) -> None:
+    """Write the information per axis (m, k), the log likelihood (m,), and add up the posteriors (K + 1,).
 
-    `expected` (m, k) are mean squared errors along the axes of each direction, `levels2` ascending; `peak` is
-    the constant of the density, relative to that of wrong directions. `values` are 0 before.
+    `expected` (m, k) are mean squared errors along the axes of each direction, `levels2` ascending, `weights`
+    the shares, those of levels times the constant of the density, relative to that of wrong directions.
     """
+    information, likelihood, sums = found
     num_levels, num_axes = len(levels2), expected.shape[1]
-    least = num_levels
+    terms, inverses, peaks = np.empty(num_levels), 1.0 / levels2, weights[1:] / levels2 ** (0.5 * num_axes)
     for e in range(len(expected)):
+        total, lowest, square, variance = weights[0], 0, 0.0, 0.0
+        for a in range(num_axes):
+            square += expected[e, a]
+            variance += own[e, a]
         for k in range(num_levels - 1, -1, -1):
-            exponent, spread = 0.0, 1.0
-            for a in range(num_axes):
-                variance = levels2[k] + own[e, a]
-                exponent += expected[e, a] / variance
-                spread *= variance
+            exponent, peak = square * inverses[k], peaks[k]
+            if variance > 0.0:
+                exponent = 0.0
+                for a in range(num_axes):
+                    exponent += expected[e, a] / (levels2[k] + own[e, a])
+                    peak *= np.sqrt(levels2[k] / (levels2[k] + own[e, a]))
             if exponent > _NEGLIGIBLE:  # and more so at lower levels
+                lowest = k + 1
                 break
-            values[e, k] = peak * np.exp(-0.5 * exponent) / np.sqrt(spread)
-            least = min(least, k)
-    return least
+            terms[k] = peak * np.exp(-0.5 * exponent)
+            total += terms[k]
+        sums[0] += weights[0] / total
+        common, information[e] = 0.0, 0.0
+        for k in range(lowest, num_levels):
+            share = terms[k] / total
+            sums[k + 1] += share
+            common += share * inverses[k]
+            if variance > 0.0:
+                for a in range(num_axes):
+                    information[e, a] += share / (levels2[k] + own[e, a])
+        if variance == 0.0:
+            information[e] = common
+        likelihood[e] = np.log(total)
 
 
 @kernel
@@ -442,8 +472,9 @@ def _assemble(at: Any, information: Any, precision: float, excess: Any, blocks: 
 
 
 @kernel
-def _project(nodes: Any, between: Any, edges: Any, across: Any, lengths: Any, variances: Any) -> None:
+def _project(inverse: Any, edges: Any, across: Any, lengths: Any, variances: Any) -> None:
     """Write the variances (m, d - 1) of the errors, by the covariances of the nodes and between both ends."""
+    nodes, between = inverse
     d = nodes.shape[1]
     for e in range(len(edges)):
         i, j = edges[e]

@@ -208,7 +208,7 @@ def test_one_signature_of_the_kernel_serves_all_graphs(on_street):
         MeasuredGraph(on_street[0], covariance=np.tile(1e-4 * np.eye(2), (len(on_street[2]), 1, 1))),
         objective="mixture",
     )
-    assert len(mixture._write_densities.signatures) == 1
+    assert len(mixture._expect.signatures) == 1
 
 
 @pytest.mark.parametrize("block", [1, 3])
