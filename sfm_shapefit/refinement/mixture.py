@@ -136,7 +136,16 @@ class _Residuals(NamedTuple):
     locations: FloatArray
     lengths: FloatArray  # (m,) floored
     units: FloatArray  # (m, d) directions of the baselines
-    errors: FloatArray  # (m, d - 1) along the axes of the covariances, radians
+    across: FloatArray  # (m, d, d - 1) axes of the covariances, less what of them is along the baselines
+    errors: FloatArray  # (m, d - 1) along these axes, radians
+
+
+class _Expectation(NamedTuple):
+    """What the directions say, each by the posterior of its level."""
+
+    information: FloatArray  # (m, d - 1) per axis, rad^-2
+    likelihood: FloatArray  # (m,) log, over that of a wrong direction
+    sums: FloatArray  # (K + 1,) of the posteriors: of being wrong, and of each level
 
 
 class _Noise(NamedTuple):
@@ -202,10 +211,10 @@ class Mixture:
             return end.bound
         at, bound, variances = self._residuals(end.locations), -np.inf, np.zeros_like(self._own)
         for _ in range(_WEIGH_ROUNDS):
-            sums = self._expect(at.errors**2 + variances, levels, 0.0)[2]
-            levels = levels._replace(right=_right_share(sums))
+            expected = at.errors**2 + variances
+            levels = levels._replace(right=_right_share(self._expect(expected, levels, 0.0).sums))
             noise = _Noise(levels, 0.0, variances, self._precision(at.lengths))
-            system = self._equations(at, noise)
+            system = self._equations(at, noise.precision, self._expect(expected, levels, 0.0))
             if not self._refactor(system, _DAMPING[1]):
                 return -np.inf
             bound, variances = self._log_determinant(system, noise) - system.cost, self._propagate(at)
@@ -215,9 +224,9 @@ class Mixture:
         at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
         for _ in range(_MOST_STEPS):
-            levels = self._fit(at.errors**2 + variances, levels, floor)
+            levels, found = self._fit(at.errors**2 + variances, levels, floor)
             noise = _Noise(levels, floor, variances, self._precision(at.lengths))
-            system = self._equations(at, noise)
+            system = self._equations(at, noise.precision, found)
             moved, damping = self._step(at, noise, system, damping)
             if moved is None:
                 break
@@ -273,55 +282,49 @@ class Mixture:
         floored = np.maximum(lengths / unit, _SHORTEST)
         units = baselines / (unit * floored)[:, None]
         angles = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(units - v, axis=1), 1.0))
-        errors = np.einsum("edk,ed->ek", self._axes, units)
+        along = np.einsum("edk,ed->ek", self._axes, units)
+        errors = along.copy()
         sines = np.linalg.norm(errors, axis=1)
         # Scaled to the angle, beyond 90 degrees too; straight behind, any axis will do.
         behind = sines <= np.finfo(float).tiny
         errors[behind, 0], sines[behind] = 1.0, 1.0
         scaled = np.asarray((t - t.mean(axis=0)) / unit)
-        return _Residuals(scaled, floored, units, errors * (angles / sines)[:, None])
+        across = self._axes - units[:, :, None] * along[:, None, :]
+        return _Residuals(scaled, floored, units, across, errors * (angles / sines)[:, None])
 
     def _expect(
         self, expected: FloatArray, levels: Levels, floor: float, own: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return information per axis (m, d - 1), log likelihood (m,), sums of the posteriors (K + 1,)."""
+    ) -> _Expectation:
+        """Return what squared errors expected along the axes, (m, d - 1), say under some levels."""
         information, likelihood = np.empty_like(expected), np.empty(len(expected))
         weights = np.r_[1.0 - levels.right, levels.right * self._peak * _NODE_SHARES]
         sums, levels2 = np.zeros_like(weights), levels.at_nodes(floor) ** 2
-        _expect(
-            expected, self._own if own is None else own, levels2, weights, (information, likelihood, sums)
-        )
-        return information, likelihood, sums
+        found = _Expectation(information, likelihood, sums)
+        _expect(expected, self._own if own is None else own, levels2, weights, found)
+        return found
 
-    def _fit(self, expected: FloatArray, levels: Levels, floor: float) -> Levels:
-        """Return the levels after some rounds of expectation maximization."""
-        least = np.log(max(floor, _LEVELS_RAD[0]))
+    def _fit(self, expected: FloatArray, levels: Levels, floor: float) -> tuple[Levels, _Expectation]:
+        """Return the levels after rounds of expectation maximization, and what is expected under them."""
+        found = self._expect(expected, levels, floor)
         for _ in range(_FIT_ROUNDS):
-            last, (information, _, sums) = levels, self._expect(expected, levels, floor)
-            counts = sums[1:] + _TINY
-            # The factor by which all levels together fit the errors, and the squares of the scores.
-            factor2 = np.vdot(information, expected) / (expected.shape[1] * counts.sum())
-            mean = np.clip(levels.mean + 0.5 * np.log(max(factor2, _TINY)), least, np.log(_LEVELS_RAD[1]))
-            gain = levels.spread**2 / (levels.spread**2 + 0.5 / expected.shape[1])
-            grown = 1.0 + (counts @ _NODES**2 / counts.sum() - 1.0) / gain
-            spread = np.clip(levels.spread * np.sqrt(max(grown, 0.0)), *_SPREADS)
-            levels = Levels(_right_share(sums), float(mean), float(spread))
+            last, levels = levels, _maximize(found, expected, levels, floor)
+            found = self._expect(expected, levels, floor)
             if np.abs(np.subtract(levels, last)).max() <= _SETTLED:
                 break
-        return levels
+        return levels, found
 
     def _judge(self, at: _Residuals, noise: _Noise, bound: float) -> MixtureEnd:
         """Return locations with the posterior that each direction is right, and its variance if it is."""
         levels = noise.levels
-        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, levels, 0.0)
-        right = _posterior(levels, likelihood)
+        found = self._expect(at.errors**2 + noise.variances, levels, 0.0)
+        right, information = _posterior(levels, found.likelihood), found.information
         usual = np.exp(2.0 * levels.mean) + self._own
         variances = (right + _UNKNOWN) / (information + _UNKNOWN / usual).mean(axis=1)
         left = 1.0 - np.minimum(
             information * noise.variances, _MOST_LEVERAGE
         )  # of an error, without the pair
         alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
-        likelihood = self._expect((at.errors / left) ** 2, levels, 0.0, self._own + alone)[1]
+        likelihood = self._expect((at.errors / left) ** 2, levels, 0.0, self._own + alone).likelihood
         return MixtureEnd(
             locations=at.locations,
             bound=bound,
@@ -336,30 +339,20 @@ class Mixture:
         return float(self._graph.num_nodes / len(logs) / tau**2)
 
     def _cost(self, at: _Residuals, noise: _Noise) -> float:
-        likelihood = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor)[1]
+        likelihood = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor).likelihood
         return _prior_cost(at.lengths, noise.precision) - float(likelihood.sum())
 
-    def _equations(self, at: _Residuals, noise: _Noise) -> _System:
+    def _equations(self, at: _Residuals, precision: float, found: _Expectation) -> _System:
         """Return the system of a step in the locations."""
-        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor)
-        across, precision = self._across(at), noise.precision
-        along = at.units[:, :, None] * at.units[:, None, :]
-        blocks = (across * information[:, None, :]) @ across.transpose(0, 2, 1) + precision * along
-        blocks = blocks / at.lengths[:, None, None] ** 2
-        blocks += (_RIDGE * np.trace(blocks, axis1=1, axis2=2))[:, None, None] * np.eye(along.shape[1])
-        pull = np.einsum("edk,ek->ed", across, information * at.errors)
-        pull += (precision * _excess_logs(at.lengths))[:, None] * at.units
+        m, d = at.units.shape
+        blocks, gradient = np.empty((m, d, d)), np.empty((m, d))
+        _assemble(at, found.information, precision, _excess_logs(at.lengths), blocks, gradient)
         return _System(
             blocks=blocks,
-            gradient=pull / at.lengths[:, None],
-            damping_unit=float(np.median(information)) / at.lengths**2,
-            cost=_prior_cost(at.lengths, precision) - float(likelihood.sum()),
+            gradient=gradient,
+            damping_unit=float(np.median(found.information)) / at.lengths**2,
+            cost=_prior_cost(at.lengths, precision) - float(found.likelihood.sum()),
         )
-
-    def _across(self, at: _Residuals) -> FloatArray:
-        """Return the axes (m, d, d - 1) less what of them is along the baselines."""
-        along = np.einsum("edk,ed->ek", self._axes, at.units)
-        return np.asarray(self._axes - at.units[:, :, None] * along[:, None, :])
 
     def _refactor(self, system: _System, damping: float) -> bool:
         """Factor the damped normal matrix; return whether it is positive definite."""
@@ -379,11 +372,8 @@ class Mixture:
 
     def _propagate(self, at: _Residuals) -> FloatArray:
         """Return the variance of each residual by that of the locations, (m, d - 1), rad^2."""
-        i, j = self._graph.edges.T
-        inverse = selected_inverse(self._factor, self._graph.edges)
-        relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
-        across = self._across(at)
-        variances = np.sum(across * (relative @ across), axis=1) / at.lengths[:, None] ** 2
+        inverse, variances = selected_inverse(self._factor, self._graph.edges), np.empty_like(self._own)
+        _project((inverse.nodes, inverse.edges), self._graph.edges, at.across, at.lengths, variances)
         return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
 
     def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
@@ -391,6 +381,18 @@ class Mixture:
         return put_by_consensus(
             self._graph, end.locations, odds, end.levels.typical**2 + self._own.mean(axis=1)
         )
+
+
+def _maximize(found: _Expectation, expected: FloatArray, levels: Levels, floor: float) -> Levels:
+    """Return the most likely levels for what was expected under some."""
+    least, counts = np.log(max(floor, _LEVELS_RAD[0])), found.sums[1:] + _TINY
+    # The factor by which all levels together fit the errors, and the squares of the scores.
+    factor2 = np.vdot(found.information, expected) / (expected.shape[1] * counts.sum())
+    mean = np.clip(levels.mean + 0.5 * np.log(max(factor2, _TINY)), least, np.log(_LEVELS_RAD[1]))
+    gain = levels.spread**2 / (levels.spread**2 + 0.5 / expected.shape[1])
+    grown = 1.0 + (counts @ _NODES**2 / counts.sum() - 1.0) / gain
+    spread = np.clip(levels.spread * np.sqrt(max(grown, 0.0)), *_SPREADS)
+    return Levels(_right_share(found.sums), float(mean), float(spread))
 
 
 def _right_share(sums: FloatArray) -> float:
@@ -415,35 +417,78 @@ def _prior_cost(lengths: FloatArray, precision: float) -> float:
 
 
 @kernel
-def _expect(expected: Any, own: Any, levels2: Any, weights: Any, out: Any) -> None:
+def _expect(expected: Any, own: Any, levels2: Any, weights: Any, found: Any) -> None:
     """Write the information per axis (m, k), the log likelihood (m,), and add up the posteriors (K + 1,).
 
     `expected` (m, k) are mean squared errors along the axes of each direction, `levels2` ascending, `weights`
     the shares, those of levels times the constant of the density, relative to that of wrong directions.
     """
-    information, likelihood, sums = out
+    information, likelihood, sums = found
     num_levels, num_axes = len(levels2), expected.shape[1]
-    terms = np.empty(num_levels)
+    terms, inverses, peaks = np.empty(num_levels), 1.0 / levels2, weights[1:] / levels2 ** (0.5 * num_axes)
     for e in range(len(expected)):
-        total, density, lowest = weights[0], 0.0, 0
+        total, lowest, square, variance = weights[0], 0, 0.0, 0.0
+        for a in range(num_axes):
+            square += expected[e, a]
+            variance += own[e, a]
         for k in range(num_levels - 1, -1, -1):
-            if k == num_levels - 1 or levels2[k] != levels2[k + 1]:
-                exponent, spread = 0.0, 1.0
+            exponent, peak = square * inverses[k], peaks[k]
+            if variance > 0.0:
+                exponent = 0.0
                 for a in range(num_axes):
-                    variance = levels2[k] + own[e, a]
-                    exponent += expected[e, a] / variance
-                    spread *= variance
-                if exponent > _NEGLIGIBLE:  # and more so at lower levels
-                    lowest = k + 1
-                    break
-                density = np.exp(-0.5 * exponent) / np.sqrt(spread)
-            terms[k] = weights[k + 1] * density
+                    exponent += expected[e, a] / (levels2[k] + own[e, a])
+                    peak *= np.sqrt(levels2[k] / (levels2[k] + own[e, a]))
+            if exponent > _NEGLIGIBLE:  # and more so at lower levels
+                lowest = k + 1
+                break
+            terms[k] = peak * np.exp(-0.5 * exponent)
             total += terms[k]
         sums[0] += weights[0] / total
-        information[e] = 0.0
+        common, information[e] = 0.0, 0.0
         for k in range(lowest, num_levels):
             share = terms[k] / total
             sums[k + 1] += share
-            for a in range(num_axes):
-                information[e, a] += share / (levels2[k] + own[e, a])
+            common += share * inverses[k]
+            if variance > 0.0:
+                for a in range(num_axes):
+                    information[e, a] += share / (levels2[k] + own[e, a])
+        if variance == 0.0:
+            information[e] = common
         likelihood[e] = np.log(total)
+
+
+@kernel
+def _assemble(at: Any, information: Any, precision: float, excess: Any, blocks: Any, gradient: Any) -> None:
+    """Write what each direction adds to the normal matrix (m, d, d) and to the gradient (m, d)."""
+    d = gradient.shape[1]
+    for e in range(len(gradient)):
+        scale, trace = 1.0 / at.lengths[e] ** 2, 0.0
+        for a in range(d):
+            pull = precision * excess[e] * at.units[e, a]
+            for q in range(d - 1):
+                pull += information[e, q] * at.errors[e, q] * at.across[e, a, q]
+            gradient[e, a] = pull / at.lengths[e]
+            for b in range(a + 1):
+                total = precision * at.units[e, a] * at.units[e, b]
+                for q in range(d - 1):
+                    total += information[e, q] * at.across[e, a, q] * at.across[e, b, q]
+                blocks[e, a, b] = blocks[e, b, a] = scale * total
+            trace += blocks[e, a, a]
+        for a in range(d):
+            blocks[e, a, a] += _RIDGE * trace
+
+
+@kernel
+def _project(inverse: Any, edges: Any, across: Any, lengths: Any, variances: Any) -> None:
+    """Write the variances (m, d - 1) of the errors, by the covariances of the nodes and between both ends."""
+    nodes, between = inverse
+    d = nodes.shape[1]
+    for e in range(len(edges)):
+        i, j = edges[e]
+        for q in range(d - 1):
+            total = 0.0
+            for a in range(d):
+                for b in range(d):
+                    block = nodes[i, a, b] + nodes[j, a, b] - between[e, a, b] - between[e, b, a]
+                    total += across[e, a, q] * block * across[e, b, q]
+            variances[e, q] = total / lengths[e] ** 2
