@@ -54,21 +54,22 @@ from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.solver.program import adjoint, differences
 
 _LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
-_NODES = np.linspace(-4.0, 4.0, 13)  # standard scores of log levels, at which their normal density is summed
+_NODES = np.linspace(-4.0, 4.0, 13)  # standard scores of log levels; finer sums of their density say the same
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
 _NEXT_FLOOR = 2.0  # typical levels; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
-_SPREADS = (0.05, 1.3)  # standard deviation of log levels, least and largest
-_PSEUDO_WRONG = 1.0  # pairs added to the wrong ones, whose share may not become 0
+_SPREADS = (
+    0.05,
+    1.3,
+)  # standard deviation of log levels, least and largest; 0 could not grow, graphs have .7 to 1.2
+_PSEUDO_WRONG = 1.0  # pairs added to the wrong ones; their share may not become 0
 _FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
-_LONGEST = (
-    50.0  # median lengths, geometric mean of a node's pairs; beyond two of the largest spreads of lengths
-)
+_LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; e^4, twice the largest spread of lengths
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
@@ -79,7 +80,7 @@ _TYPICAL = 0.84  # standard score of a log level; the level that four of five ha
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
 _UNKNOWN = 1e-6  # probability of being right; a direction of less has the usual variance
 _MOST_LEVERAGE = 0.9  # share of a residual's variance; nothing but the pair holds such a camera
-_WEIGH_ROUNDS = 3  # of share and variances, at locations that stay
+_WEIGH_ROUNDS = 3  # rounds of share and variances at locations that stay; they settle in as many
 _TINY = float(np.finfo(np.float64).tiny)
 _LARGEST_VARIANCE = 1.0  # rad^2; a direction that nothing determines has no more
 _NODE_SHARES = np.exp(-0.5 * _NODES**2) / np.exp(-0.5 * _NODES**2).sum()
@@ -145,7 +146,7 @@ class _Expectation(NamedTuple):
 
     information: FloatArray  # (m, d - 1) per axis, rad^-2
     likelihood: FloatArray  # (m,) log, over that of a wrong direction
-    sums: FloatArray  # (K + 1,) of the posteriors: of being wrong, and of each level
+    sums: FloatArray  # (K + 1,) sums of the posteriors: that of being wrong, and of each level
 
 
 class _Noise(NamedTuple):
@@ -320,9 +321,7 @@ class Mixture:
         right, information = _posterior(levels, found.likelihood), found.information
         usual = np.exp(2.0 * levels.mean) + self._own
         variances = (right + _UNKNOWN) / (information + _UNKNOWN / usual).mean(axis=1)
-        left = 1.0 - np.minimum(
-            information * noise.variances, _MOST_LEVERAGE
-        )  # of an error, without the pair
+        left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)
         alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
         likelihood = self._expect((at.errors / left) ** 2, levels, 0.0, self._own + alone).likelihood
         return MixtureEnd(
