@@ -96,6 +96,10 @@ def test_four_equal_sides_are_folded_by_the_usual_way_and_not_by_evidence(seed):
         assert shape_error(place(graph).locations, truth) > 0.5
     assert shape_error(found.locations, truth) < 0.01
     assert np.mean(found.agreement.agrees == is_wrong) < 0.005
+    rival = found.refined.rivals[0]  # the fold, with what speaks against it
+    assert shape_error(rival.end.locations, truth) > 0.5
+    assert rival.behind > 100.0
+    assert rival.end.right_share < found.refined.posterior.mean()
     assert "at weights that are the pairs' posteriors" in found.refined.reason
 
 
