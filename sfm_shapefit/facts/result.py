@@ -41,15 +41,15 @@ from sfm_shapefit.facts.placed import (
     TakenForRight,
     facts_of_placement,
 )
+from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.scene import Loop, told_distances
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
-from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
+from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import (
     Shares,
-    judge_graph,
     judge_model,
     too_few_to_judge,
     weigh_evidence,
@@ -479,13 +479,16 @@ def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
 class GraphResult(_Placed):
     """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
 
-    _PUBLIC = ("cameras", "pairs", "table", "options", "timings_s", "placement", "further", "certified")
+    _PUBLIC = (
+        *("cameras", "pairs", "table", "warnings", "options", "timings_s"),
+        *("placement", "further", "certified"),
+    )
     path: Path
     """The graph's file or folder."""
     statement: str
     """What it is, and where rotations came from, for the user."""
     options: PlacementOptions
-    placement: Judged
+    placement: PlacedGraph
     further: tuple[Judged, ...]
     """The further rigid pieces of three nodes or more, each with a scale of its own."""
     timings_s: dict[str, float]
@@ -501,7 +504,7 @@ class GraphResult(_Placed):
             **facts_of_placement(placement, self.cameras, solved, (math.nan, SOLVER_UNITS)),
             options=flat_values(self.options),
             delivered=Delivered.compare(placement, placement.locations, adjusted=False),
-            warnings=list(graph_warnings(placement)),
+            warnings=list(self.warnings),
             inputs=GraphInputs(graph=str(self.path), directions=self.statement),
             dimension=placement.graph.dimension,
             right_pairs=TakenForRight(
@@ -527,10 +530,15 @@ class GraphResult(_Placed):
         """None: nodes have no images."""
         return ()
 
-    @cached_property
+    @property
     def verdict(self) -> ModelVerdict:
         """Whether the model can be used, and why."""
-        return judge_graph(self.placement)
+        return self.placement.verdict
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to know and to do, a sentence each."""
+        return self.placement.warnings
 
     @cached_property
     def cameras(self) -> list[CameraRow]:

@@ -17,6 +17,7 @@ from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Kind, Reason, of_model
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_fit import PriorFit
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.options import Status
 
 _ALARMING_SHARE = 0.5  # share of pairs against the solution, or the given rotations; above, warn
@@ -59,8 +60,8 @@ def rotation_suspicions(turned_deg: FloatArray, sigma_deg: float) -> Iterator[Re
         yield of_model(Kind.INPUT, clause)
 
 
-def quality_warnings(placement: Judged) -> Iterator[str]:
-    """Yield what the user should know about a solution, a sentence each."""
+def quality_warnings(placement: Judged, options: PlacementOptions | None = None) -> Iterator[str]:
+    """Yield what the user should know about a solution, found with some options, a sentence each."""
     if placement.certified.status is not Status.CONVERGED:
         yield f"the solve is not certified to the tolerance: {placement.certified.status.value}"
     if placement.certified.unique is False:
@@ -73,13 +74,21 @@ def quality_warnings(placement: Judged) -> Iterator[str]:
         assert refined.disagreement is not None
         yield (
             f"two ways to find lengths disagree by {refined.disagreement:.0%}, as on long chains and with "
-            "many wrong pairs" + ("" if refined.is_refined else "; objective=auto refines both and compares")
+            "many wrong pairs" + ("" if refined.is_refined else _how_to_refine(options))
         )
     yield from _uncertainty_warnings(placement)
     if contradicting > _ALARMING_SHARE:
         yield f"{contradicting:.0%} of the pairs contradict the solution and are set aside"
     if placement.second_configuration is not None:
         yield placement.second_configuration.statement()
+
+
+def _how_to_refine(options: PlacementOptions | None) -> str:
+    """Say which option refines the starts of an unrefined answer; nothing if none in force prevents it."""
+    if options is None or options.refines:
+        return ""
+    other = "refine=True" if not options.refine else f"objective={PlacementOptions().objective}"
+    return f"; {other} refines both and compares"
 
 
 def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
@@ -156,9 +165,9 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
         )
 
 
-def graph_warnings(placement: Judged) -> Iterator[str]:
+def graph_warnings(placement: Judged, options: PlacementOptions | None = None) -> Iterator[str]:
     """Yield what the user should know about a bare graph, all of whose placed nodes are in the answer."""
-    yield from quality_warnings(placement)
+    yield from quality_warnings(placement, options)
     floor = TrustOptions().min_trust
     low = np.flatnonzero(placement.assessment.trust < floor)
     if len(low):

@@ -3,7 +3,7 @@
 Do not use, if any of these holds:
 
     the pairs that agree hold less than half of the cameras in one rigid piece, also with the points that fit,
-    however many contradict; of a bare graph, the residuals of its directions have a level above 6 degrees
+    however many contradict
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than half of all images are in the output
@@ -27,8 +27,8 @@ can be named, if
     the images can be arranged in two ways (`rotations.arrangements`), whichever was taken
 
 It cannot be judged, unless it is not to be used, if nothing checks it: it has two cameras only, or no pair
-says how two of them stand to each other, as where poses come without points and database; or, in a bare
-graph, no pair is checked by others.
+says how two of them stand to each other, as where poses come without points and database. Bare graphs have
+rules of their own besides (`graph_grade`).
 
 Otherwise the model is good. How many of the observations see a 3D point is told, and decides nothing: on
 thirteen real scenes with good rotations 53 to 99.8 % do (least of all those of facing cameras in a park, who
@@ -49,20 +49,16 @@ from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import (
     FEW,
     HALF,
-    KNOWN_DEG,
     MANY,
     RARE,
     SMALLEST_SHAPE,
-    SURE_SIGMAS,
 )
 from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
-from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
 
-MOST_LEVEL_DEG = SURE_SIGMAS * KNOWN_DEG  # degrees, level of agreeing residuals; see the header
 FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to be looked at
 
 
@@ -147,17 +143,6 @@ def too_few_to_judge(num_cameras: int) -> Iterator[Reason]:
         yield of_model(Kind.UNCHECKED, clause, Grade.CANNOT_BE_JUDGED)
 
 
-def judge_graph(placement: Judged) -> ModelVerdict:
-    """Return the verdict on a placed graph, which has no observations."""
-    level, assessment, reasons = placement.assessment.level_deg, placement.assessment, list[Reason]()
-    if level > MOST_LEVEL_DEG:
-        clause = f"the directions are {level:.0f} degrees off the cameras"
-        reasons.append(of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE))
-    if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
-        reasons.append(of_model(Kind.UNCHECKED, "no pair is checked by others", Grade.CANNOT_BE_JUDGED))
-    return judge_model(placement, Shares(), reasons)
-
-
 def judge_model(
     placement: Judged, shares: Shares, before: Iterable[Reason] = (), after: Iterable[Reason] = ()
 ) -> ModelVerdict:
@@ -169,9 +154,10 @@ def judge_model(
         before: what else speaks against the model, whose cameras are named first.
         after: the same, named last.
     """
-    second = placement.second_configuration is not None
-    repeated = of_model(Kind.REPEATED, "many rejected pairs agree on a second configuration")
-    doubted = *before, *_doubtful_cameras(placement), *after, *((repeated,) if second else ())
+    doubted = *before, *_doubtful_cameras(placement), *after
+    if (second := placement.second_configuration) is not None:
+        grade = Grade.DO_NOT_USE if second.is_as_good else Grade.LOOK
+        doubted = *doubted, of_model(Kind.REPEATED, second.clause, grade)
     return ModelVerdict.weigh([*doubted, *_weigh_shares(shares)])
 
 
@@ -213,7 +199,14 @@ def uncertain_cameras(placement: Judged) -> IntArray:
     """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
     if len(placement.cameras) < SMALLEST_PIECE:
         return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(largest_sigmas(placement) > RARE * extent_of(placement.locations))
+    return np.flatnonzero(sigmas_of_extent(placement) > RARE)
+
+
+def sigmas_of_extent(placement: Judged) -> FloatArray:
+    """Return the same as `largest_sigmas` as shares of the extent."""
+    extent = max(extent_of(placement.locations), float(np.finfo(float).tiny))
+    with np.errstate(over="ignore"):  # where all stand in one place
+        return np.asarray(largest_sigmas(placement) / extent)
 
 
 def largest_sigmas(placement: Judged) -> FloatArray:

@@ -10,7 +10,12 @@ from sfm_shapefit.base.geometry import extent_of
 from sfm_shapefit.judgement.limits import KNOWN_DEG
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.placement.second_configuration import SecondConfiguration, find_second_configuration
+from sfm_shapefit.placement.second_configuration import (
+    SecondConfiguration,
+    find_fold,
+    find_rival,
+    find_second_configuration,
+)
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.lens import LensErrors
 
@@ -22,7 +27,7 @@ class Judged(Placement):
     assessment: Assessment
     """Evidence for the nodes and edges of the placement, in the solver's units."""
     second_configuration: SecondConfiguration | None
-    """Another placement that many of the rejected pairs agree on; its cameras are nodes of the graph."""
+    """Another placement that many pairs agree on; its cameras are nodes of the graph."""
     adjusted_covariances: FloatArray | None = None
     """(k, 3, 3) covariances of adjusted centers, squared solver's units; NaN where unknown, None without an
     adjustment."""
@@ -81,7 +86,12 @@ def judge(placement: Placement, options: PlacementOptions) -> Judged:
         max_bytes=options.solver.factor_bytes,
         agreement=agreement,
     )
-    second = find_second_configuration(part.graph, part.pairs, agreement.agrees, assessment.level_deg)
+    is_bare = part.evidence is None  # what matches say of a model says more of folds
+    second = (
+        (find_rival(placement.refined) if is_bare else None)
+        or find_second_configuration(part.graph, part.pairs, agreement.agrees, assessment.level_deg)
+        or (find_fold(part.graph, agreement.agrees) if is_bare else None)
+    )
     if second is not None:
         second = replace(second, cameras=placement.nodes[second.cameras])
     as_placed = {item.name: getattr(placement, item.name) for item in fields(Placement)}

@@ -252,7 +252,8 @@ def _propagate_freely(
         leverages[rows] = found.leverages
         break
     else:
-        covariances[:] = np.nan
+        if measured.evidence is not None:  # pixels may know them all the same
+            covariances[:] = np.nan
     return covariances[node_of], leverages
 
 

@@ -11,6 +11,7 @@ import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their rep
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.result import GraphResult
 from sfm_shapefit.files.colmap.other_programs import relative_poses_of
 from sfm_shapefit.files.g2o import is_g2o, read_g2o, read_g2o_rotations
@@ -19,7 +20,7 @@ from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.files.onedsfm import EpipolarGeometries, is_onedsfm, read_onedsfm, read_rotations
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.judgement.judged import Judged, judge
+from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.placement.place import place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -39,12 +40,12 @@ def place(
     sigma: npt.ArrayLike | None = None,
     on_iteration: OnIteration | None = None,
     **overrides: Any,
-) -> Judged:
+) -> PlacedGraph:
     """Place the largest rigid piece of a view graph: both convex starts, refinement, verdicts, trust.
 
         graph = ViewGraph(num_cameras, edges, directions)     # (m, 2) pairs (i, j), (m, d) of t_i - t_j
         placed = place(graph)
-        placed.cameras, placed.locations, placed.assessment.trust
+        placed.positions, placed.verdict.grade, placed.warnings
 
     This is what `sfm-shapefit place` does. `solve` is the certified program alone, whose optimum
     collapses on long chains and under heavy corruption.
@@ -68,7 +69,8 @@ def place(
     graph = MeasuredGraph(measured) if isinstance(measured, ViewGraph) else measured
     if sigma is not None:
         graph = replace(graph, covariance=_covariances(graph.graph, sigma))
-    return judge(next(place_pieces(graph, options, on_iteration=on_iteration)), options)
+    placed = next(place_pieces(graph, options, on_iteration=on_iteration))
+    return PlacedGraph.of(judge(placed, options), options)
 
 
 def _covariances(graph: ViewGraph, sigma: npt.ArrayLike) -> FloatArray:
@@ -143,7 +145,7 @@ def place_graph_file(
         path=Path(path if isinstance(path, Path | str) else "pose graph in memory"),
         statement=statement,
         options=options,
-        placement=judged[0],
+        placement=PlacedGraph.of(judged[0], options),
         further=tuple(judged[1:]),
         timings_s=clock.seconds,
     )

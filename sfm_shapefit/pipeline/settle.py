@@ -354,7 +354,7 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
     yield from found.told_evidence.statements
     yield from intrinsics_warnings(found.intrinsics.rows(images))
     yield from match_warnings(stand.directions, may_repeat=stand.source.has_database)
-    yield from quality_warnings(found.placement)
+    yield from quality_warnings(found.placement, found.options.placement)
     yield from trust_warnings(found.placement, found.kept)
     yield from ambiguity_warnings(found.placement)
     yield from stand.failures

@@ -95,7 +95,7 @@ class Placement(Displayed):
 
     @property
     def locations(self) -> FloatArray:
-        """The centers (k, d) of `cameras`, in the solver's units."""
+        """The centers (k, d) of `cameras` only, row by row of these, in the solver's units."""
         return self.refined.locations[: len(self.cameras)]
 
     @property

@@ -1,9 +1,11 @@
 """Locations of most evidence under a mixture of noise levels: a refinement for pairs that differ in noise.
 
 The model. Direction e is right or wrong. A wrong one is uniform on the sphere. A right one is off by normal
-errors a_e of variance s_k^2 + own variance per axis: its own covariance where it states one, and s_k one of a
-fixed grid of levels, since pairs of one graph differ in noise by a factor of ten, and one level for all
-either rejects the noisy ones or believes wrong ones. Share w_0 of the pairs is wrong, w_k of level k.
+errors a_e of variance s_e^2 + own variance per axis: its own covariance where it states one, and a level s_e
+that is log-normal, since pairs of one graph differ in noise by a factor of ten, and one level for all either
+rejects the noisy ones or believes wrong ones. Shares of each level that are free would call a second hump of
+coherently wrong pairs, ten times as far off, right and noisy. The density of log s_e is summed at nodes s_k
+of weight w_k, which move with its mean and standard deviation; w_0 is the share of wrong pairs.
 Lengths have a weak prior: cameras that share matches are about as far apart as others that do, whether or not
 their direction is right. All m pairs together count as n observations of it, one a camera:
 
@@ -16,14 +18,17 @@ which level. The best posterior of the levels for given T and S leaves the varia
 
 up to a constant, where each density has the mean E a_e^2 = a_e^2 + J_e S J_e' in the place of the square, J_e
 being the derivative of the error by the locations. A pair that a loose camera fits exactly is not believed
-for that: J_e S J_e' is how far that camera can go. A descent takes, in turn, the shares w by rounds of
-expectation maximization; T by a step of Levenberg and Marquardt at the information per pair that the
+for that: J_e S J_e' is how far that camera can go. At the end, a pair is right if its error is likely both as
+it is and as the other pairs predict it: with h_e the pair's share of the information on its own residual, the
+error is a_e / (1 - h_e) then, and J_e S J_e' / (1 - h_e) its variance. A descent takes, in turn, the levels
+by expectation maximization; T by a step of Levenberg and Marquardt at the information per pair that the
 posteriors of the levels give; and S, the inverse of the matrix of that step, of which the blocks of the pairs
-are needed alone (`laplacian.selected`). No level falls, only shares move: the model cannot collapse onto the
-few pairs that fit best.
+are needed alone (`laplacian.selected`). The mean level is that at which the squares E a_e^2 are as large as
+expected, those of the loosest cameras included: it cannot collapse onto the few pairs that fit best.
 
-A floor under the levels falls from step to step, which draws a far start in (graduated non-convexity); the
-bound at its end decides between starts. The best end is left by `consensus` for places where more rays meet,
+A floor under the levels falls from step to step, which draws a far start in (graduated non-convexity). Two
+ends are compared by their bounds at the noise of the noisier one: the larger consistent set wins, not the
+sharper one. The best end is left by `consensus` for places where more rays meet,
 as long as the bound grows.
 
 Sources: Bishop, "Pattern Recognition and Machine Learning", 2006, sections 10.1 and 10.2, for variational
@@ -48,28 +53,61 @@ from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.solver.program import adjoint, differences
 
-_LEVELS_RAD = np.geomspace(1e-7, 0.25, 22)
-"""Noise levels, radians, two of them a factor of 2 apart; noise below the first is none, beyond the last
-nothing is known of a direction."""
+_LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
+_NODES = np.linspace(-4.0, 4.0, 13)  # standard scores of log levels; finer sums of their density say the same
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
-_NEXT_FLOOR_RAD = 0.01  # radians; after a consensus, which is nearer than a start
+_NEXT_FLOOR = 2.0  # typical levels; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
-_PSEUDO_WRONG, _PSEUDO_LEVEL = 1.0, 0.05  # pairs added to the count of each share; none may become 0
+_SPREADS = (
+    0.05,
+    1.3,
+)  # standard deviation of log levels, least and largest; 0 could not grow, graphs have .7 to 1.2
+_PSEUDO_WRONG = 1.0  # pairs added to the wrong ones; their share may not become 0
 _FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
+_LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; e^4, twice the largest spread of lengths
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
 _LEAST_GAIN = 0.5  # nats; a smaller change of the bound is none
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
-_TYPICAL = 0.8  # share of the right pairs; the level that so many have at most serves a consensus
+_TYPICAL = 0.84  # standard score of a log level; the level that four of five have at most
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
+_UNKNOWN = 1e-6  # probability of being right; a direction of less has the usual variance
+_MOST_LEVERAGE = 0.9  # share of a residual's variance; nothing but the pair holds such a camera
+_WEIGH_ROUNDS = 3  # rounds of share and variances at locations that stay; they settle in as many
+_TINY = float(np.finfo(np.float64).tiny)
 _LARGEST_VARIANCE = 1.0  # rad^2; a direction that nothing determines has no more
+_NODE_SHARES = np.exp(-0.5 * _NODES**2) / np.exp(-0.5 * _NODES**2).sum()
+
+
+class Levels(NamedTuple):
+    """Share and noise of right directions."""
+
+    right: float
+    """Share of the directions that are right."""
+    mean: float
+    """Mean of the log levels, in radians, of these."""
+    spread: float
+    """Their standard deviation."""
+
+    def at_nodes(self, floor: float) -> FloatArray:
+        """Return levels (K,), radians, ascending, at which their density is summed; none below a floor."""
+        lowest, highest = _LEVELS_RAD
+        return np.clip(np.exp(self.mean + self.spread * _NODES), max(floor, lowest), highest)
+
+    @property
+    def typical(self) -> float:
+        """The level, radians, that four of five right directions have at most."""
+        return float(np.clip(np.exp(self.mean + _TYPICAL * self.spread), *_LEVELS_RAD))
+
+
+_FIRST_LEVELS = Levels(right=0.5, mean=float(np.log(_FIRST_FLOOR_RAD)), spread=1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,13 +122,13 @@ class MixtureEnd:
     """(m,) probability that each direction is right."""
     variances: FloatArray
     """(m,) variance per axis of the error of each direction if it is right, rad^2, own part included."""
-    shares: FloatArray
-    """(K + 1,) shares of wrong directions and of each level."""
+    levels: Levels
+    """Share and noise of the right directions."""
 
     @property
     def right_share(self) -> float:
         """Share of the directions that are right."""
-        return float(1.0 - self.shares[0])
+        return self.levels.right
 
 
 class _Residuals(NamedTuple):
@@ -99,13 +137,22 @@ class _Residuals(NamedTuple):
     locations: FloatArray
     lengths: FloatArray  # (m,) floored
     units: FloatArray  # (m, d) directions of the baselines
-    errors: FloatArray  # (m, d - 1) along the axes of the covariances, radians
+    across: FloatArray  # (m, d, d - 1) axes of the covariances, less what of them is along the baselines
+    errors: FloatArray  # (m, d - 1) along these axes, radians
+
+
+class _Expectation(NamedTuple):
+    """What the directions say, each by the posterior of its level."""
+
+    information: FloatArray  # (m, d - 1) per axis, rad^-2
+    likelihood: FloatArray  # (m,) log, over that of a wrong direction
+    sums: FloatArray  # (K + 1,) sums of the posteriors: that of being wrong, and of each level
 
 
 class _Noise(NamedTuple):
     """The model of one step."""
 
-    shares: FloatArray  # (K + 1,)
+    levels: Levels
     floor: float  # radians; lower levels count as this one
     variances: FloatArray  # (m, d - 1) rad^2, residuals by the locations
     precision: float  # 1 / variance of a log length in the prior
@@ -129,17 +176,18 @@ class Mixture:
         d, bases = graph.dimension, tangent_bases(graph.directions)
         self._own, self._axes = np.zeros((graph.num_edges, d - 1)), bases
         if measured.covariance is not None:
-            known = np.isfinite(measured.covariance).all(axis=(1, 2), keepdims=True)
+            known = np.asarray(np.isfinite(measured.covariance).all(axis=(1, 2), keepdims=True))
             variances, turns = np.linalg.eigh(np.where(known, measured.covariance, 0.0))
             self._own, self._axes = np.maximum(variances, 0.0), np.asarray(bases @ turns)
+            if known.any():  # the levels are those of what the others have beyond their own
+                self._own[~known[:, 0, 0]] = np.median(self._own[known[:, 0, 0]])
         log_sphere = np.log(2.0) + 0.5 * d * np.log(np.pi) - gammaln(0.5 * d)
         self._peak = float(np.exp(log_sphere - 0.5 * (d - 1) * np.log(2.0 * np.pi)))
         self._factor = allocate_factor(plan, d)
 
     def descend(self, start: FloatArray) -> MixtureEnd | None:
         """Return where a descent from (n, d) locations ends; None if its equations are singular."""
-        count = len(_LEVELS_RAD)
-        return self._descend(start, _FIRST_FLOOR_RAD, np.r_[0.5, np.full(count, 0.5 / count)])
+        return self._descend(start, _FIRST_FLOOR_RAD, _FIRST_LEVELS)
 
     def improve(self, end: MixtureEnd) -> MixtureEnd:
         """Return the end of most evidence that consensus and descents, in turn, lead to."""
@@ -147,19 +195,39 @@ class Mixture:
             moved = self._put_by_consensus(end)
             if np.array_equal(moved, end.locations):
                 break
-            found = self._descend(moved, _NEXT_FLOOR_RAD, end.shares)
+            found = self._descend(moved, min(_NEXT_FLOOR * end.levels.typical, _FIRST_FLOOR_RAD), end.levels)
             if found is None or found.bound <= end.bound + _ROUND_GAIN:
                 break
             end = found
         return end
 
-    def _descend(self, start: FloatArray, floor: float, shares: FloatArray) -> MixtureEnd | None:
-        at, damping, bound, last = self._residuals(start), _DAMPING[0], -np.inf, None
+    def lead(self, end: MixtureEnd, other: MixtureEnd) -> float:
+        """Return by how many nats the bound of one end is above the other's, at the noise of the noisier."""
+        noise = max(end.levels, other.levels, key=lambda levels: levels.typical)
+        return self._weigh(end, noise) - self._weigh(other, noise)
+
+    def _weigh(self, end: MixtureEnd, levels: Levels) -> float:
+        """Return the bound at the locations of an end, where right directions have such levels."""
+        if end.levels is levels:
+            return end.bound
+        at, bound, variances = self._residuals(end.locations), -np.inf, np.zeros_like(self._own)
+        for _ in range(_WEIGH_ROUNDS):
+            expected = at.errors**2 + variances
+            levels = levels._replace(right=_right_share(self._expect(expected, levels, 0.0).sums))
+            noise = _Noise(levels, 0.0, variances, self._precision(at.lengths))
+            system = self._equations(at, noise.precision, self._expect(expected, levels, 0.0))
+            if not self._refactor(system, _DAMPING[1]):
+                return -np.inf
+            bound, variances = self._log_determinant(system, noise) - system.cost, self._propagate(at)
+        return bound
+
+    def _descend(self, start: FloatArray, floor: float, levels: Levels) -> MixtureEnd | None:
+        at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
         for _ in range(_MOST_STEPS):
-            shares = self._fit(at.errors**2 + variances, shares, floor)
-            noise = _Noise(shares, floor, variances, self._precision(at.lengths))
-            system = self._equations(at, noise)
+            levels, found = self._fit(at.errors**2 + variances, levels, floor)
+            noise = _Noise(levels, floor, variances, self._precision(at.lengths))
+            system = self._equations(at, noise.precision, found)
             moved, damping = self._step(at, noise, system, damping)
             if moved is None:
                 break
@@ -168,8 +236,27 @@ class Mixture:
             if floor <= _NOISELESS_RAD and abs(bound - before) < _LEAST_GAIN:
                 break
             variances, at = self._propagate(at), moved  # the variance of a residual hardly moves in a step
-            floor = max(floor * _FALL, float(_LEVELS_RAD[0]))
+            floor = max(floor * _FALL, _LEVELS_RAD[0])
         return None if last is None else self._judge(*last)
+
+    def _draw_in(self, t: FloatArray) -> FloatArray:
+        """Return locations with the nodes whose pairs are very long amid their neighbors.
+
+        Nothing determines such a node, and at the scale of the others the prior of lengths hardly moves it.
+        """
+        edges, n = self._graph.edges, self._graph.num_nodes
+        lengths = np.linalg.norm(differences(t, edges), axis=1)
+        logs = np.log(np.maximum(lengths / max(float(np.median(lengths)), _TINY), _SHORTEST))
+        degrees = self._graph.degrees()
+        far = np.bincount(edges.ravel(), np.repeat(logs, 2), n) > np.log(_LONGEST) * degrees
+        if not far.any():
+            return t
+        others, ends = edges[:, ::-1][near := ~far[edges[:, ::-1]]], edges[near]
+        counts, t = np.bincount(ends, minlength=n), t.copy()
+        sums = np.stack([np.bincount(ends, x[others], n) for x in t.T], axis=1)
+        far &= counts > 0
+        t[far] = sums[far] / counts[far, None]
+        return t
 
     def _step(
         self, at: _Residuals, noise: _Noise, system: _System, damping: float
@@ -181,7 +268,7 @@ class Mixture:
         right = -adjoint(system.gradient, self._graph.edges, self._graph.num_nodes)
         while damping <= _DAMPING[2]:
             if self._refactor(system, damping):
-                proposed = at.locations + self._factor.solve(right)
+                proposed = self._draw_in(at.locations + self._factor.solve(right))
                 there = self._residuals(proposed)
                 if self._cost(there, noise) < system.cost:
                     return there, max(damping / 10.0, _DAMPING[1])
@@ -196,46 +283,53 @@ class Mixture:
         floored = np.maximum(lengths / unit, _SHORTEST)
         units = baselines / (unit * floored)[:, None]
         angles = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(units - v, axis=1), 1.0))
-        errors = np.einsum("edk,ed->ek", self._axes, units)
+        along = np.einsum("edk,ed->ek", self._axes, units)
+        errors = along.copy()
         sines = np.linalg.norm(errors, axis=1)
         # Scaled to the angle, beyond 90 degrees too; straight behind, any axis will do.
         behind = sines <= np.finfo(float).tiny
         errors[behind, 0], sines[behind] = 1.0, 1.0
         scaled = np.asarray((t - t.mean(axis=0)) / unit)
-        return _Residuals(scaled, floored, units, errors * (angles / sines)[:, None])
+        across = self._axes - units[:, :, None] * along[:, None, :]
+        return _Residuals(scaled, floored, units, across, errors * (angles / sines)[:, None])
 
     def _expect(
-        self, expected: FloatArray, shares: FloatArray, floor: float
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return information per axis (m, d - 1), log likelihood (m,), sums of the posteriors (K + 1,)."""
+        self, expected: FloatArray, levels: Levels, floor: float, own: FloatArray | None = None
+    ) -> _Expectation:
+        """Return what squared errors expected along the axes, (m, d - 1), say under some levels."""
         information, likelihood = np.empty_like(expected), np.empty(len(expected))
-        sums, weights = np.zeros_like(shares), shares * np.r_[1.0, np.full(len(_LEVELS_RAD), self._peak)]
-        levels = np.maximum(_LEVELS_RAD, floor)
-        _expect(expected, self._own, levels**2, weights, (information, likelihood, sums))
-        return information, likelihood, sums
+        weights = np.r_[1.0 - levels.right, levels.right * self._peak * _NODE_SHARES]
+        sums, levels2 = np.zeros_like(weights), levels.at_nodes(floor) ** 2
+        found = _Expectation(information, likelihood, sums)
+        _expect(expected, self._own if own is None else own, levels2, weights, found)
+        return found
 
-    def _fit(self, expected: FloatArray, shares: FloatArray, floor: float) -> FloatArray:
-        """Return the shares after some rounds of expectation maximization."""
+    def _fit(self, expected: FloatArray, levels: Levels, floor: float) -> tuple[Levels, _Expectation]:
+        """Return the levels after rounds of expectation maximization, and what is expected under them."""
+        found = self._expect(expected, levels, floor)
         for _ in range(_FIT_ROUNDS):
-            sums = self._expect(expected, shares, floor)[2]
-            sums += np.r_[_PSEUDO_WRONG, np.full(len(_LEVELS_RAD), _PSEUDO_LEVEL)]
-            last, shares = shares, sums / sums.sum()
-            if np.abs(shares - last).max() <= _SETTLED:
+            last, levels = levels, _maximize(found, expected, levels, floor)
+            found = self._expect(expected, levels, floor)
+            if np.abs(np.subtract(levels, last)).max() <= _SETTLED:
                 break
-        return shares
+        return levels, found
 
     def _judge(self, at: _Residuals, noise: _Noise, bound: float) -> MixtureEnd:
         """Return locations with the posterior that each direction is right, and its variance if it is."""
-        shares, tiny = noise.shares, np.finfo(float).tiny
-        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, shares, 0.0)
-        right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
-        variances = np.maximum(right, tiny) / np.maximum(information.mean(axis=1), tiny)
+        levels = noise.levels
+        found = self._expect(at.errors**2 + noise.variances, levels, 0.0)
+        right, information = _posterior(levels, found.likelihood), found.information
+        usual = np.exp(2.0 * levels.mean) + self._own
+        variances = (right + _UNKNOWN) / (information + _UNKNOWN / usual).mean(axis=1)
+        left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)
+        alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
+        likelihood = self._expect((at.errors / left) ** 2, levels, 0.0, self._own + alone).likelihood
         return MixtureEnd(
             locations=at.locations,
             bound=bound,
-            posterior=right,
+            posterior=np.minimum(right, _posterior(levels, likelihood)),
             variances=np.maximum(variances, _LEVELS_RAD[0] ** 2),
-            shares=shares,
+            levels=levels,
         )
 
     def _precision(self, lengths: FloatArray) -> float:
@@ -244,30 +338,20 @@ class Mixture:
         return float(self._graph.num_nodes / len(logs) / tau**2)
 
     def _cost(self, at: _Residuals, noise: _Noise) -> float:
-        likelihood = self._expect(at.errors**2 + noise.variances, noise.shares, noise.floor)[1]
+        likelihood = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor).likelihood
         return _prior_cost(at.lengths, noise.precision) - float(likelihood.sum())
 
-    def _equations(self, at: _Residuals, noise: _Noise) -> _System:
+    def _equations(self, at: _Residuals, precision: float, found: _Expectation) -> _System:
         """Return the system of a step in the locations."""
-        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, noise.shares, noise.floor)
-        across, precision = self._across(at), noise.precision
-        along = at.units[:, :, None] * at.units[:, None, :]
-        blocks = (across * information[:, None, :]) @ across.transpose(0, 2, 1) + precision * along
-        blocks = blocks / at.lengths[:, None, None] ** 2
-        blocks += (_RIDGE * np.trace(blocks, axis1=1, axis2=2))[:, None, None] * np.eye(along.shape[1])
-        pull = np.einsum("edk,ek->ed", across, information * at.errors)
-        pull += (precision * _excess_logs(at.lengths))[:, None] * at.units
+        m, d = at.units.shape
+        blocks, gradient = np.empty((m, d, d)), np.empty((m, d))
+        _assemble(at, found.information, precision, _excess_logs(at.lengths), blocks, gradient)
         return _System(
             blocks=blocks,
-            gradient=pull / at.lengths[:, None],
-            damping_unit=float(np.median(information)) / at.lengths**2,
-            cost=_prior_cost(at.lengths, precision) - float(likelihood.sum()),
+            gradient=gradient,
+            damping_unit=float(np.median(found.information)) / at.lengths**2,
+            cost=_prior_cost(at.lengths, precision) - float(found.likelihood.sum()),
         )
-
-    def _across(self, at: _Residuals) -> FloatArray:
-        """Return the axes (m, d, d - 1) less what of them is along the baselines."""
-        along = np.einsum("edk,ed->ek", self._axes, at.units)
-        return np.asarray(self._axes - at.units[:, :, None] * along[:, None, :])
 
     def _refactor(self, system: _System, damping: float) -> bool:
         """Factor the damped normal matrix; return whether it is positive definite."""
@@ -287,18 +371,37 @@ class Mixture:
 
     def _propagate(self, at: _Residuals) -> FloatArray:
         """Return the variance of each residual by that of the locations, (m, d - 1), rad^2."""
-        i, j = self._graph.edges.T
-        inverse = selected_inverse(self._factor, self._graph.edges)
-        relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
-        across = self._across(at)
-        variances = np.sum(across * (relative @ across), axis=1) / at.lengths[:, None] ** 2
+        inverse, variances = selected_inverse(self._factor, self._graph.edges), np.empty_like(self._own)
+        _project((inverse.nodes, inverse.edges), self._graph.edges, at.across, at.lengths, variances)
         return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
 
     def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
-        right = np.cumsum(end.shares[1:])
-        level = _LEVELS_RAD[min(np.searchsorted(right, _TYPICAL * right[-1]), len(_LEVELS_RAD) - 1)]
         odds = np.full(len(self._own), logit(end.right_share))
-        return put_by_consensus(self._graph, end.locations, odds, level**2 + self._own.mean(axis=1))
+        return put_by_consensus(
+            self._graph, end.locations, odds, end.levels.typical**2 + self._own.mean(axis=1)
+        )
+
+
+def _maximize(found: _Expectation, expected: FloatArray, levels: Levels, floor: float) -> Levels:
+    """Return the most likely levels for what was expected under some."""
+    least, counts = np.log(max(floor, _LEVELS_RAD[0])), found.sums[1:] + _TINY
+    # The factor by which all levels together fit the errors, and the squares of the scores.
+    factor2 = np.vdot(found.information, expected) / (expected.shape[1] * counts.sum())
+    mean = np.clip(levels.mean + 0.5 * np.log(max(factor2, _TINY)), least, np.log(_LEVELS_RAD[1]))
+    gain = levels.spread**2 / (levels.spread**2 + 0.5 / expected.shape[1])
+    grown = 1.0 + (counts @ _NODES**2 / counts.sum() - 1.0) / gain
+    spread = np.clip(levels.spread * np.sqrt(max(grown, 0.0)), *_SPREADS)
+    return Levels(_right_share(found.sums), float(mean), float(spread))
+
+
+def _right_share(sums: FloatArray) -> float:
+    """Return the most likely share of right directions for sums of the posteriors (K + 1,)."""
+    return float(sums[1:].sum() / (sums.sum() + _PSEUDO_WRONG))
+
+
+def _posterior(levels: Levels, likelihood: FloatArray) -> FloatArray:
+    """Return the probability that each direction is right, from the log likelihood of the mixture (m,)."""
+    return np.asarray(-np.expm1(np.minimum(np.log1p(-levels.right) - likelihood, 0.0)))
 
 
 def _excess_logs(lengths: FloatArray) -> FloatArray:
@@ -313,35 +416,78 @@ def _prior_cost(lengths: FloatArray, precision: float) -> float:
 
 
 @kernel
-def _expect(expected: Any, own: Any, levels2: Any, weights: Any, out: Any) -> None:
+def _expect(expected: Any, own: Any, levels2: Any, weights: Any, found: Any) -> None:
     """Write the information per axis (m, k), the log likelihood (m,), and add up the posteriors (K + 1,).
 
     `expected` (m, k) are mean squared errors along the axes of each direction, `levels2` ascending, `weights`
     the shares, those of levels times the constant of the density, relative to that of wrong directions.
     """
-    information, likelihood, sums = out
+    information, likelihood, sums = found
     num_levels, num_axes = len(levels2), expected.shape[1]
-    terms = np.empty(num_levels)
+    terms, inverses, peaks = np.empty(num_levels), 1.0 / levels2, weights[1:] / levels2 ** (0.5 * num_axes)
     for e in range(len(expected)):
-        total, density, lowest = weights[0], 0.0, 0
+        total, lowest, square, variance = weights[0], 0, 0.0, 0.0
+        for a in range(num_axes):
+            square += expected[e, a]
+            variance += own[e, a]
         for k in range(num_levels - 1, -1, -1):
-            if k == num_levels - 1 or levels2[k] != levels2[k + 1]:
-                exponent, spread = 0.0, 1.0
+            exponent, peak = square * inverses[k], peaks[k]
+            if variance > 0.0:
+                exponent = 0.0
                 for a in range(num_axes):
-                    variance = levels2[k] + own[e, a]
-                    exponent += expected[e, a] / variance
-                    spread *= variance
-                if exponent > _NEGLIGIBLE:  # and more so at lower levels
-                    lowest = k + 1
-                    break
-                density = np.exp(-0.5 * exponent) / np.sqrt(spread)
-            terms[k] = weights[k + 1] * density
+                    exponent += expected[e, a] / (levels2[k] + own[e, a])
+                    peak *= np.sqrt(levels2[k] / (levels2[k] + own[e, a]))
+            if exponent > _NEGLIGIBLE:  # and more so at lower levels
+                lowest = k + 1
+                break
+            terms[k] = peak * np.exp(-0.5 * exponent)
             total += terms[k]
         sums[0] += weights[0] / total
-        information[e] = 0.0
+        common, information[e] = 0.0, 0.0
         for k in range(lowest, num_levels):
             share = terms[k] / total
             sums[k + 1] += share
-            for a in range(num_axes):
-                information[e, a] += share / (levels2[k] + own[e, a])
+            common += share * inverses[k]
+            if variance > 0.0:
+                for a in range(num_axes):
+                    information[e, a] += share / (levels2[k] + own[e, a])
+        if variance == 0.0:
+            information[e] = common
         likelihood[e] = np.log(total)
+
+
+@kernel
+def _assemble(at: Any, information: Any, precision: float, excess: Any, blocks: Any, gradient: Any) -> None:
+    """Write what each direction adds to the normal matrix (m, d, d) and to the gradient (m, d)."""
+    d = gradient.shape[1]
+    for e in range(len(gradient)):
+        scale, trace = 1.0 / at.lengths[e] ** 2, 0.0
+        for a in range(d):
+            pull = precision * excess[e] * at.units[e, a]
+            for q in range(d - 1):
+                pull += information[e, q] * at.errors[e, q] * at.across[e, a, q]
+            gradient[e, a] = pull / at.lengths[e]
+            for b in range(a + 1):
+                total = precision * at.units[e, a] * at.units[e, b]
+                for q in range(d - 1):
+                    total += information[e, q] * at.across[e, a, q] * at.across[e, b, q]
+                blocks[e, a, b] = blocks[e, b, a] = scale * total
+            trace += blocks[e, a, a]
+        for a in range(d):
+            blocks[e, a, a] += _RIDGE * trace
+
+
+@kernel
+def _project(inverse: Any, edges: Any, across: Any, lengths: Any, variances: Any) -> None:
+    """Write the variances (m, d - 1) of the errors, by the covariances of the nodes and between both ends."""
+    nodes, between = inverse
+    d = nodes.shape[1]
+    for e in range(len(edges)):
+        i, j = edges[e]
+        for q in range(d - 1):
+            total = 0.0
+            for a in range(d):
+                for b in range(d):
+                    block = nodes[i, a, b] + nodes[j, a, b] - between[e, a, b] - between[e, b, a]
+                    total += across[e, a, q] * block * across[e, b, q]
+            variances[e, q] = total / lengths[e] ** 2

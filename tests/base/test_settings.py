@@ -236,7 +236,7 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
     assert repr(solved).startswith("<SolverResult: 12 locations, converged")
     placed = sfm_shapefit.place(problem.view_graph, refine=False)
     assert (placed.refined.is_refined, placed.certified.converged) == (False, True)
-    assert repr(placed).startswith("<Judged: 12 of 12 nodes placed, 0 of")
+    assert repr(placed).startswith("<PlacedGraph: good: 12 of 12 nodes placed, 0 of")
     located.timings_s["<script>"] = 1.0
     table = located._repr_html_()
     del located.timings_s["<script>"]

@@ -8,7 +8,8 @@ import pytest
 from sfm_shapefit import synthetic
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.grade import judge_graph, weigh_evidence
+from sfm_shapefit.judgement.grade import weigh_evidence
+from sfm_shapefit.judgement.graph_grade import judge_graph
 from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam
@@ -18,6 +19,7 @@ from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.prior_fit import PriorFit
+from sfm_shapefit.placement.second_configuration import Found, SecondConfiguration
 from tests.program import run
 from tests.scenes import BUNDLED
 
@@ -105,8 +107,10 @@ def test_one_prior_may_be_wrong_and_two_of_eight_make_a_look_worthwhile(found):
 
 
 def test_rejected_pairs_that_agree_on_a_second_configuration_make_a_look_worthwhile(found):
-    second = replace(found.placement, second_configuration=object())
-    verdict = replace(found, placement=second).verdict
+    seen = SecondConfiguration(
+        found=Found.BY_REJECTED_PAIRS, cameras=np.arange(8), num_pairs=9, num_against=20
+    )
+    verdict = replace(found, placement=replace(found.placement, second_configuration=seen)).verdict
     assert verdict.statement == "look: many rejected pairs agree on a second configuration"
 
 

@@ -63,7 +63,7 @@ def test_a_result_serves_wherever_a_model_does(tmp_path, ring_located, ring_mapp
 def test_a_graph_is_placed_from_its_file_and_is_no_model():
     placed = sfm_shapefit.place(BUNDLED / "graph40.txt")
     assert len(placed.cameras) == 40
-    with pytest.raises(sfm_shapefit.InputError, match="a Judged is no model; give a folder"):
+    with pytest.raises(sfm_shapefit.InputError, match="a PlacedGraph is no model; give a folder"):
         sfm_shapefit.evaluate(placed, RING / "sparse/0")
 
 
