@@ -56,7 +56,7 @@ _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and t
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
 _SPREADS = (0.05, 1.3)  # standard deviation of log levels, least and largest
 _PSEUDO_WRONG = 1.0  # pairs added to the wrong ones, whose share may not become 0
-_FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
+_FIT_ROUNDS = 2  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
@@ -67,8 +67,10 @@ _LONGEST = (
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
-_LEAST_GAIN = 0.5  # nats; a smaller change of the bound is none
+_STEPS_APART = 3  # steps from one inverse to the next; variances hardly move in one
+_LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.003  # nats; a smaller change of the bound is none
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
+_FAR = 3.0  # typical levels, at a node's mean log length; a consensus that moves none so far gains nothing
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
 _TYPICAL = 0.84  # standard score of a log level; the level that four of five have at most
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
@@ -176,6 +178,7 @@ class Mixture:
         log_sphere = np.log(2.0) + 0.5 * d * np.log(np.pi) - gammaln(0.5 * d)
         self._peak = float(np.exp(log_sphere - 0.5 * (d - 1) * np.log(2.0 * np.pi)))
         self._factor = allocate_factor(plan, d)
+        self._least_gain = max(_LEAST_GAIN, _LEAST_GAIN_A_CAMERA * graph.num_nodes)
 
     def descend(self, start: FloatArray) -> MixtureEnd | None:
         """Return where a descent from (n, d) locations ends; None if its equations are singular."""
@@ -216,19 +219,20 @@ class Mixture:
     def _descend(self, start: FloatArray, floor: float, levels: Levels) -> MixtureEnd | None:
         at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
-        for _ in range(_MOST_STEPS):
+        for step in range(_MOST_STEPS):
             levels, found = self._fit(at.errors**2 + variances, levels, floor)
             noise = _Noise(levels, floor, variances, self._precision(at.lengths))
             system = self._equations(at, noise.precision, found)
             moved, damping = self._step(at, noise, system, damping)
             if moved is None:
                 break
-            before, bound = bound, self._log_determinant(system, noise) - system.cost
-            last = at, noise, bound
-            if floor <= _NOISELESS_RAD and abs(bound - before) < _LEAST_GAIN:
-                break
-            variances, at = self._propagate(at), moved  # the variance of a residual hardly moves in a step
-            floor = max(floor * _FALL, _LEVELS_RAD[0])
+            if step % _STEPS_APART == 0:
+                before, bound = bound, self._log_determinant(system, noise) - system.cost
+                last = at, noise, bound
+                if floor <= _NOISELESS_RAD and abs(bound - before) < self._least_gain:
+                    break
+                variances = self._propagate(at)
+            at, floor = moved, max(floor * _FALL, _LEVELS_RAD[0])
         return None if last is None else self._judge(*last)
 
     def _draw_in(self, t: FloatArray) -> FloatArray:
@@ -371,9 +375,13 @@ class Mixture:
 
     def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
         odds = np.full(len(self._own), logit(end.right_share))
-        return put_by_consensus(
+        moved = put_by_consensus(
             self._graph, end.locations, odds, end.levels.typical**2 + self._own.mean(axis=1)
         )
+        ends, lengths = self._graph.edges.ravel(), self._residuals(end.locations).lengths
+        typical = np.bincount(ends, np.repeat(np.log(lengths), 2), len(moved)) / self._graph.degrees()
+        far = np.linalg.norm(moved - end.locations, axis=1) > _FAR * end.levels.typical * np.exp(typical)
+        return np.where(far[:, None], moved, end.locations)
 
 
 def _maximize(found: _Expectation, expected: FloatArray, levels: Levels, floor: float) -> Levels:
