@@ -93,7 +93,7 @@ class Levels(NamedTuple):
     """Their standard deviation."""
 
     def at_nodes(self, floor: float) -> FloatArray:
-        """Return the levels (K,), radians, ascending, at which their density is summed; none below a floor."""
+        """Return the levels (K,), radians, ascending, that their density is summed at; none below a floor."""
         lowest, highest = _LEVELS_RAD
         return np.clip(np.exp(self.mean + self.spread * _NODES), max(floor, lowest), highest)
 
