@@ -24,7 +24,7 @@ from sfm_shapefit.base.jit import array_address, inner_kernel, kernel
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.laplacian.dense import blas_of, gemm, trsm
 
-_STRIP = 64  # rows of a product of which only a triangle is wanted
+_STRIP = 64  # rows of a product; half of it is wanted, and smaller products are slower
 _Solve = Callable[[FloatArray], FloatArray]
 
 
@@ -100,7 +100,7 @@ class _Memory(NamedTuple):
     """Where the kernels work; all matrices are column-major."""
 
     waiting: FloatArray  # -Z_RR of each supernode, from when its parent is done until it is done itself
-    work: FloatArray  # of one supernode: L_JJ^-T, -Z_JJ, -Y^T, Z_JR
+    work: FloatArray  # L_JJ^-T, -Z_JJ, -Y^T, Z_JR of one supernode
     starts: IntArray  # (4,) where these are in `work`
     places: IntArray  # (S,) where each supernode's block is in `waiting`
 
@@ -130,7 +130,7 @@ def _invert(plan: Any, panels: Any, memory: Any, blas: Any, nodes: Any, blocks: 
             work[root_at + k] = 0.0
         for k in range(width):
             work[root_at + k * (width + 1)] = 1.0
-        for i in range(0, width, _STRIP):  # of rows; what is beside a triangle is left out
+        for i in range(0, width, _STRIP):  # strips of rows; the other triangle is left out
             rows, corner = min(_STRIP, width - i), i * (width + 1) * size
             right = width - i
             trsm(blas, (panel + i * (height + 1) * size, height), (root + corner, width), rows, right)

@@ -130,7 +130,7 @@ class RefinedPlacement:
     """(m,) variance per axis of each direction if it is right, rad^2; None where one level serves all."""
 
     rivals: tuple[Rival, ...] = ()
-    """Where other starts led to under a mixture, most evidence first; often the same place as the kept."""
+    """Where other starts led to under a mixture, most evidence first; often to the place of the kept one."""
 
     @property
     def collapsed(self) -> bool:
