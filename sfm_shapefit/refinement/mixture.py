@@ -64,7 +64,7 @@ _SPREADS = (
     1.3,
 )  # standard deviation of log levels, least and largest; 0 could not grow, graphs have .7 to 1.2
 _PSEUDO_WRONG = 1.0  # pairs added to the wrong ones; their share may not become 0
-_FIT_ROUNDS = 2  # rounds of the shares in a step; the next step goes on with them
+_FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
@@ -73,7 +73,6 @@ _LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; e^4, twice 
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
-_STEPS_APART = 3  # steps from one inverse to the next; variances hardly move in one
 _LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.003  # nats; a smaller change of the bound is none
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
 _FAR = 3.0  # typical levels, at a node's mean log length; a consensus that moves none so far gains nothing
@@ -227,19 +226,18 @@ class Mixture:
     def _descend(self, start: FloatArray, floor: float, levels: Levels) -> MixtureEnd | None:
         at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
-        for step in range(_MOST_STEPS):
+        for _ in range(_MOST_STEPS):
             levels, found = self._fit(at.errors**2 + variances, levels, floor)
             noise = _Noise(levels, floor, variances, self._precision(at.lengths))
             system = self._equations(at, noise.precision, found)
             moved, damping = self._step(at, noise, system, damping)
             if moved is None:
                 break
-            if step % _STEPS_APART == 0:
-                before, bound = bound, self._log_determinant(system, noise) - system.cost
-                last = at, noise, bound
-                if floor <= _NOISELESS_RAD and abs(bound - before) < self._least_gain:
-                    break
-                variances = self._propagate(at)
+            before, bound = bound, self._log_determinant(system, noise) - system.cost
+            last = at, noise, bound
+            if floor <= _NOISELESS_RAD and abs(bound - before) < self._least_gain:
+                break
+            variances = self._propagate(at)
             at, floor = moved, max(floor * _FALL, _LEVELS_RAD[0])
         return None if last is None else self._judge(*last)
 
