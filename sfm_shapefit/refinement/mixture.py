@@ -73,8 +73,9 @@ _LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; e^4, twice 
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
-_LEAST_GAIN = 0.5  # nats; a smaller change of the bound is none
+_LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.003  # nats; a smaller change of the bound is none
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
+_FAR = 3.0  # typical levels, at a node's mean log length; a consensus that moves none so far gains nothing
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
 _TYPICAL = 0.84  # standard score of a log level; the level that four of five have at most
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
@@ -184,6 +185,7 @@ class Mixture:
         log_sphere = np.log(2.0) + 0.5 * d * np.log(np.pi) - gammaln(0.5 * d)
         self._peak = float(np.exp(log_sphere - 0.5 * (d - 1) * np.log(2.0 * np.pi)))
         self._factor = allocate_factor(plan, d)
+        self._least_gain = max(_LEAST_GAIN, _LEAST_GAIN_A_CAMERA * graph.num_nodes)
 
     def descend(self, start: FloatArray) -> MixtureEnd | None:
         """Return where a descent from (n, d) locations ends; None if its equations are singular."""
@@ -233,10 +235,10 @@ class Mixture:
                 break
             before, bound = bound, self._log_determinant(system, noise) - system.cost
             last = at, noise, bound
-            if floor <= _NOISELESS_RAD and abs(bound - before) < _LEAST_GAIN:
+            if floor <= _NOISELESS_RAD and abs(bound - before) < self._least_gain:
                 break
-            variances, at = self._propagate(at), moved  # the variance of a residual hardly moves in a step
-            floor = max(floor * _FALL, _LEVELS_RAD[0])
+            variances = self._propagate(at)
+            at, floor = moved, max(floor * _FALL, _LEVELS_RAD[0])
         return None if last is None else self._judge(*last)
 
     def _draw_in(self, t: FloatArray) -> FloatArray:
@@ -377,9 +379,13 @@ class Mixture:
 
     def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
         odds = np.full(len(self._own), logit(end.right_share))
-        return put_by_consensus(
+        moved = put_by_consensus(
             self._graph, end.locations, odds, end.levels.typical**2 + self._own.mean(axis=1)
         )
+        ends, lengths = self._graph.edges.ravel(), self._residuals(end.locations).lengths
+        typical = np.bincount(ends, np.repeat(np.log(lengths), 2), len(moved)) / self._graph.degrees()
+        far = np.linalg.norm(moved - end.locations, axis=1) > _FAR * end.levels.typical * np.exp(typical)
+        return np.where(far[:, None], moved, end.locations)
 
 
 def _maximize(found: _Expectation, expected: FloatArray, levels: Levels, floor: float) -> Levels:
