@@ -1,7 +1,7 @@
 """Rotations averaged from relative ones, and how far they can be believed."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -32,6 +32,9 @@ class AveragedRotations(Displayed):
     """Pairs whose residuals count in the answer."""
     num_tried: int = 1
     """How many answers it was chosen from."""
+    counts: Literal["with", "without"] | None = None
+    """Whether the answer was found with the counts of matches, or without them because they mislead; None if
+    all pairs have the same count."""
     num_repeated: int = 0
     """Pairs that most matches speak for, and that are set aside as repeated structure, see `arrangements`."""
     num_rivals: int = 0
