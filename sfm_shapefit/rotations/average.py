@@ -152,14 +152,12 @@ def _choose(
     given: AveragingPairs, votes: FloatArray, subsets: list[BoolArray], threads: int
 ) -> AveragedRotations:
     """Return the most consistent of several answers, by counts of matches or without."""
-    chosen, counts = _most_consistent(given, votes, votes, subsets, threads), None
-    if np.ptp(given.supports) > 0.0:
-        counts = "with"
-        if not chosen.agree.all():
-            alike = replace(given, supports=np.ones_like(given.supports))
-            plain = _most_consistent(alike, np.ones_like(votes), votes, subsets, threads)
-            if _counts_mislead(given, votes, chosen.agree, plain.agree):
-                chosen, counts = plain, "without"
+    chosen, counts_mislead = _most_consistent(given, votes, votes, subsets, threads), False
+    if np.ptp(given.supports) > 0.0 and not chosen.agree.all():
+        alike = replace(given, supports=np.ones_like(given.supports))
+        plain = _most_consistent(alike, np.ones_like(votes), votes, subsets, threads)
+        counts_mislead = _do_counts_mislead(given, votes, chosen.agree, plain.agree)
+        chosen = plain if counts_mislead else chosen
     best = chosen.answer
     if len(best.given.pairs) <= _MANY_PAIRS:
         turns, last = refine_fully(best.given, best.system, best.turns, _LAST_ROUNDS)
@@ -180,7 +178,7 @@ def _choose(
         share=float(votes[chosen.agree].sum() / votes[both].sum()),
         num_pairs=int(np.sum(~np.isnan(best.last.distances))),
         num_tried=chosen.num_tried,
-        counts=counts,
+        counts_mislead=counts_mislead,
         certified=None if certificate is None else certificate.certified,
         certainty_estimated=certificate is not None and certificate.certified and not certificate.proved,
     )
@@ -202,7 +200,7 @@ def _most_consistent(
     return _Choice(best, chosen_agree, best_agreements, num_tried)
 
 
-def _counts_mislead(
+def _do_counts_mislead(
     given: AveragingPairs, votes: FloatArray, counted: BoolArray, plain: BoolArray
 ) -> bool:
     """Return whether the pairs (k,) that agree without counts say more than those with counts; see above."""

@@ -54,7 +54,7 @@ def test_directions_in_world_axes_point_to_the_first_camera_and_camera_axes_beco
     folder, rotations, centers = write_scene(tmp_path)
     found = read_onedsfm(folder)
     cam_from_world, all_known = read_rotations(folder / "rots.txt", found.names)
-    graph = found.view_graph(cam_from_world, all_known)
+    graph = found.measured(cam_from_world, all_known).graph
     i, j = graph.edges.T
     assert graph.names == ("0", "10", "20", "30", "40", "50")
     np.testing.assert_allclose(graph.directions, normalized(centers[i] - centers[j]), atol=1e-12)
@@ -68,7 +68,7 @@ def test_directions_in_world_axes_point_to_the_first_camera_and_camera_axes_beco
 def test_cameras_without_rotation_have_no_directions_and_the_format_is_told_from_bare_graphs(tmp_path):
     folder, _, _ = write_scene(tmp_path, num_rotations=4)
     found = read_onedsfm(folder)
-    graph = found.view_graph(*read_rotations(folder / "rots.txt", found.names))
+    graph = found.measured(*read_rotations(folder / "rots.txt", found.names)).graph
     assert graph.degrees().tolist() == [3, 3, 3, 3, 0, 0]
     folder_with(folder, graph="0 1 1 0 0\n1 2 0 1 0\n", wide="0 1 1" + " 0" * 11 + "\n")
     assert is_onedsfm(folder)
@@ -153,7 +153,7 @@ def test_the_edges_of_a_g2o_file_are_relative_poses_and_its_vertices_rotations(t
     rotations, known = read_g2o_rotations(file, poses.names)
     assert known.all()
     np.testing.assert_allclose(rotations, cam_from_world, atol=1e-14)
-    graph = poses.view_graph(rotations, known)
+    graph = poses.measured(rotations, known).graph
     np.testing.assert_allclose(graph.directions, normalized(centers[i] - centers[j]), atol=1e-12)
 
 
