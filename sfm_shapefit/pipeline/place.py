@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.base.settings import merge_options
@@ -24,6 +24,7 @@ from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.placement.place import place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.posterior import weigh_by_triangles
 from sfm_shapefit.rotations.average import average_rotations
 from sfm_shapefit.solver.options import OnIteration
 
@@ -62,7 +63,9 @@ def place(
         rotations: (m, 3, 3) cam_j_from_cam_i of each edge (i, j). They are averaged, and pairs off the
             averaged ones by more than 10 degrees leave the graph: repeated structure often turns a pair whose
             direction agrees with those of other false ones.
-        num_matches: (m,) matches behind each of these rotations, see `average_rotations`; all alike if None.
+        num_matches: (m,) matches behind each of these rotations, see `average_rotations`. If None, all count
+            alike, and no pair leaves if the directions of most such pairs close triangles: then the averaged
+            rotations are those of a folded scene.
         on_iteration: as of `place_pieces`.
         **overrides: single options by name: `place(graph, refine=False)`.
 
@@ -95,21 +98,23 @@ def _without_contradicted(
         graph.edges, rotations, num_images=graph.num_nodes, weights=num_matches, threads=threads
     )
     relative = np.asarray(rotations, dtype=np.float64)
-    agreeing = _agreeing(graph.edges, relative, averaged.rotations, MAX_ROTATION_ERROR_DEG)
-    return measured.subset(agreeing[averaged.registered[graph.edges[agreeing]].all(axis=1)])
+    agree = _agree(graph.edges, relative, averaged.rotations, MAX_ROTATION_ERROR_DEG)
+    leave = averaged.registered[graph.edges].all(axis=1) & ~agree
+    if num_matches is None and leave.any() and np.mean(weigh_by_triangles(graph).log_odds[leave] > 0.0) > 0.5:
+        return measured
+    return measured.subset(np.flatnonzero(~leave))
 
 
-def _agreeing(pairs: IntArray, relative: FloatArray, rotations: FloatArray, most_deg: float) -> IntArray:
-    """Return the rows of the pairs (m, 2) whose rotations agree with those of the cameras (n, 3, 3)."""
+def _agree(pairs: IntArray, relative: FloatArray, rotations: FloatArray, most_deg: float) -> BoolArray:
+    """Return which relative rotations of pairs (m, 2) agree with those of the cameras (n, 3, 3), (m,)."""
     i, j = pairs.T
-    errors_deg = rotation_angles_deg(relative @ rotations[i] @ rotations[j].swapaxes(1, 2))
-    agreeing = np.flatnonzero(errors_deg <= most_deg)
-    if len(agreeing) == 0:
+    agree = rotation_angles_deg(relative @ rotations[i] @ rotations[j].swapaxes(1, 2)) <= most_deg
+    if not agree.any():
         raise InputError(
             f"none of the {len(pairs)} relative rotations agrees with those of the cameras; "
             "check that they belong together"
         )
-    return agreeing
+    return np.asarray(agree)
 
 
 def _covariances(graph: ViewGraph, sigma: npt.ArrayLike) -> FloatArray:
@@ -227,7 +232,7 @@ def _orient(
             origin += " without numbers of matches, with which fewer pairs agree"
         elif poses.num_matches is not None:
             origin += " by the numbers of matches"
-    agreeing = _agreeing(poses.pairs, poses.rotations, rotations, max_rotation_error_deg)
+    agreeing = np.flatnonzero(_agree(poses.pairs, poses.rotations, rotations, max_rotation_error_deg))
     total, kept = len(poses.pairs), len(agreeing)
     statement = (
         f"{int(np.sum(known))} of {len(known)} rotations {origin}; {total - kept} of {total} pairs "
