@@ -14,15 +14,17 @@ factorization: it lives from the parent to the supernode, the same interval run 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
-from sfm_shapefit.base.scipy_parts import dtrtri
+from sfm_shapefit.base.jit import array_address, inner_kernel, kernel
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+from sfm_shapefit.laplacian.dense import blas_of, gemm, trsm
 
+_STRIP = 64  # rows of a product of which only a triangle is wanted
 _Solve = Callable[[FloatArray], FloatArray]
 
 
@@ -53,63 +55,145 @@ def selected_inverse(factor: CholeskyFactor, edges: IntArray) -> SelectedInverse
     plan, b = factor.symbolic, factor.block
     if factor.dtype != np.float64 or len(edges) != plan.num_edges:
         raise ValueError("selected_inverse takes a float64 factor and the edges it was planned for")
-    nodes = np.empty((plan.num_nodes, b, b))
-    blocks = np.empty((plan.num_edges, b, b))
-    waiting = np.empty((plan.stack_size + plan.arena_size) * b * b)
+    nodes, blocks = np.empty((plan.num_nodes, b, b)), np.empty((plan.num_edges, b, b))
     places = plan.update_offsets.copy()
     for begin, end in plan.tasks.tolist():
         places[begin : end - 1] += plan.stack_size  # one task at a time has the arena
-    places *= b * b
+    widths, below = np.diff(plan.first) * b, np.diff(plan.row_pointers) * b
+    areas = widths * widths, widths * widths, widths * below, widths * below
+    memory = _Memory(
+        waiting=np.empty((plan.stack_size + plan.arena_size) * b * b),
+        work=np.empty(int(sum(np.max(area, initial=0) for area in areas))),
+        starts=np.cumsum([0, *(np.max(area, initial=0) for area in areas[:-1])]),
+        places=places * b * b,
+    )
+    plan_arrays = _Plan(
+        b, plan.first, plan.row_pointers, plan.panel_pointers, plan.relative, plan.child_pointers,
+        plan.children, plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
+        plan.permutation,
+    )  # fmt: skip
     with one_blas_thread():
-        for s in range(plan.num_supernodes - 1, -1, -1):
-            front = _front_inverse(factor, s, int(places[s]), waiting)
-            _hand_to_children(plan, b, s, front, places, waiting)
-            _store(plan, b, s, front, nodes, blocks)
+        _invert(plan_arrays, factor.panels, memory, blas_of(factor.dtype), nodes, blocks)
     reversed_edges = plan.inverse[edges[:, 0]] < plan.inverse[edges[:, 1]]  # stored: (later, earlier)
     blocks[reversed_edges] = blocks[reversed_edges].transpose(0, 2, 1)
     return SelectedInverse(nodes=nodes, edges=blocks)
 
 
-def _front_inverse(factor: CholeskyFactor, s: int, start: int, waiting: FloatArray) -> FloatArray:
-    """Return the inverse on all rows of a supernode's panel, own columns first."""
-    plan, b = factor.symbolic, factor.block
-    width = int(plan.first[s + 1] - plan.first[s]) * b
-    below = int(plan.row_pointers[s + 1] - plan.row_pointers[s]) * b
-    offset = int(plan.panel_pointers[s]) * b * b
-    panel = factor.panels[offset : offset + width * (width + below)].reshape(width, width + below)
-    inverse_root, _ = dtrtri(panel[:, :width].T, lower=1)  # panel rows are columns of L
-    inverse_root = np.tril(inverse_root)
-    front = np.empty((width + below, width + below))
-    front[:width, :width] = inverse_root.T @ inverse_root
-    if below:
-        rest = waiting[start : start + below * below].reshape(below, below)
-        y = panel[:, width:].T @ inverse_root
-        cross = -(rest @ y)
-        front[:width, :width] -= y.T @ cross
-        front[width:, :width] = cross
-        front[:width, width:] = cross.T
-        front[width:, width:] = rest
-    return front
+class _Plan(NamedTuple):
+    """What the kernels need of the plan."""
+
+    b: int
+    first: IntArray
+    row_pointers: IntArray
+    panel_pointers: IntArray
+    relative: Int32Array
+    child_pointers: IntArray
+    children: IntArray
+    edge_pointers: IntArray
+    edge_index: Int32Array
+    edge_row: Int32Array
+    edge_column: Int32Array
+    permutation: IntArray
 
 
-def _hand_to_children(
-    plan: SymbolicFactor, b: int, s: int, front: FloatArray, places: IntArray, waiting: FloatArray
-) -> None:
-    """Copy to each child's place on the stack what it needs of its parent's front."""
-    for child in plan.children[plan.child_pointers[s] : plan.child_pointers[s + 1]].tolist():
-        there = plan.relative[plan.row_pointers[child] : plan.row_pointers[child + 1]].astype(np.int64)
-        rows = (there[:, None] * b + np.arange(b)).ravel()
-        start = int(places[child])
-        waiting[start : start + len(rows) ** 2] = front[np.ix_(rows, rows)].ravel()
+class _Memory(NamedTuple):
+    """Where the kernels work; all matrices are column-major."""
+
+    waiting: FloatArray  # -Z_RR of each supernode, from when its parent is done until it is done itself
+    work: FloatArray  # of one supernode: L_JJ^-T, -Z_JJ, -Y^T, Z_JR
+    starts: IntArray  # (4,) where these are in `work`
+    places: IntArray  # (S,) where each supernode's block is in `waiting`
 
 
-def _store(
-    plan: SymbolicFactor, b: int, s: int, front: FloatArray, nodes: FloatArray, blocks: FloatArray
-) -> None:
+@kernel
+def _invert(plan: Any, panels: Any, memory: Any, blas: Any, nodes: Any, blocks: Any) -> None:
+    """Write the inverse's blocks of the nodes (n, b, b) and edges (m, b, b), the later node of an edge first.
+
+    BLAS subtracts products here, hence the signs of what is kept.
+    """
+    b, first, row_pointers, work = plan.b, plan.first, plan.row_pointers, memory.work
+    root_at, own_at, y_at, cross_at = memory.starts
+    size, base = work.itemsize, array_address(work)
+    for s in range(len(first) - 2, -1, -1):
+        width = (first[s + 1] - first[s]) * b
+        below = (row_pointers[s + 1] - row_pointers[s]) * b
+        panel = array_address(panels) + plan.panel_pointers[s] * b * b * size
+        height, most = width + below, max(below, 1)
+        root, own, y, cross = (
+            base + root_at * size,
+            base + own_at * size,
+            base + y_at * size,
+            base + cross_at * size,
+        )
+        rest = array_address(memory.waiting) + memory.places[s] * size, most
+        for k in range(width * width):
+            work[root_at + k] = 0.0
+        for k in range(width):
+            work[root_at + k * (width + 1)] = 1.0
+        for i in range(0, width, _STRIP):  # of rows; what is beside a triangle is left out
+            rows, corner = min(_STRIP, width - i), i * (width + 1) * size
+            right = width - i
+            trsm(blas, (panel + i * (height + 1) * size, height), (root + corner, width), rows, right)
+            beside = root + i * width * size, width
+            gemm(
+                blas, (root + corner, width), beside, (rows, i + rows, right), (own + i * size, width), False
+            )
+            if below > 0:
+                under = panel + (width + i * height) * size, height
+                gemm(blas, (root + corner, width), under, (rows, below, right), (y + i * size, width), False)
+        if below > 0:
+            gemm(blas, (y, width), rest, (width, below, below), (cross, width), False)
+            for i in range(0, width, _STRIP):
+                rows = min(_STRIP, width - i)
+                shape, at = (rows, i + rows, below), i * size
+                gemm(blas, (y + at, width), (cross, width), shape, (own + at, width), True)
+        for i in range(width):
+            for j in range(i):
+                work[own_at + i * width + j] = work[own_at + j * width + i]
+        inverse = work[own_at : own_at + width * width], work[cross_at : cross_at + width * below]
+        _hand_to_children(s, plan, memory, inverse, width, below)
+        _store(s, plan, inverse, width, nodes, blocks)
+
+
+@inner_kernel
+def _hand_to_children(s: int, plan: Any, memory: Any, inverse: Any, width: int, below: int) -> None:
+    """Copy to each child's place what it needs of its parent's inverse, one triangle and its mirror image."""
+    b, waiting, (own, cross) = plan.b, memory.waiting, inverse
+    rest = memory.places[s]
+    for q in range(plan.child_pointers[s], plan.child_pointers[s + 1]):
+        child = plan.children[q]
+        begin, count = plan.row_pointers[child], plan.row_pointers[child + 1] - plan.row_pointers[child]
+        start, side = memory.places[child], count * b
+        for i in range(count):
+            row = np.int64(plan.relative[begin + i]) * b
+            for j in range(i + 1):
+                column = np.int64(plan.relative[begin + j]) * b
+                for a in range(b):
+                    for c in range(b):
+                        if row < width:
+                            value = own[(row + a) * width + column + c]
+                        elif column < width:
+                            value = -cross[(row + a - width) * width + column + c]
+                        else:
+                            value = waiting[rest + (row + a - width) * below + column + c - width]
+                        waiting[start + (i * b + a) * side + j * b + c] = value
+                        waiting[start + (j * b + c) * side + i * b + a] = value
+
+
+@inner_kernel
+def _store(s: int, plan: Any, inverse: Any, width: int, nodes: Any, blocks: Any) -> None:
     """Write the blocks of a supernode's own columns to their nodes and edges."""
-    tiles = front.reshape(len(front) // b, b, len(front) // b, b)
-    first, last = int(plan.first[s]), int(plan.first[s + 1])
-    own = np.arange(last - first)
-    nodes[plan.permutation[first:last]] = tiles[own, :, own, :]
-    slots = slice(int(plan.edge_pointers[s]), int(plan.edge_pointers[s + 1]))
-    blocks[plan.edge_index[slots]] = tiles[plan.edge_row[slots], :, plan.edge_column[slots], :]
+    b, (own, cross) = plan.b, inverse
+    for k in range(width // b):
+        node = plan.permutation[plan.first[s] + k]
+        for a in range(b):
+            for c in range(b):
+                nodes[node, a, c] = -own[(k * b + a) * width + k * b + c]
+    for k in range(plan.edge_pointers[s], plan.edge_pointers[s + 1]):
+        e, row, column = plan.edge_index[k], np.int64(plan.edge_row[k]) * b, plan.edge_column[k] * b
+        for a in range(b):
+            for c in range(b):
+                if row < width:
+                    blocks[e, a, c] = -own[(row + a) * width + column + c]
+                else:
+                    blocks[e, a, c] = cross[(row + a - width) * width + column + c]

@@ -48,19 +48,22 @@ from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.solver.program import adjoint, differences
 
-_LEVELS_RAD = np.geomspace(1e-7, 0.25, 22)
-"""Noise levels, radians, two of them a factor of 2 apart; noise below the first is none, beyond the last
+_LEVELS_RAD = np.geomspace(1e-7, 0.25, 43)
+"""Noise levels, radians, each 1.4 times the last; noise below the first is none, beyond the last
 nothing is known of a direction."""
+_LOG_LEVELS = np.log(_LEVELS_RAD)
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
-_NEXT_FLOOR_RAD = 0.01  # radians; after a consensus, which is nearer than a start
+_NEXT_FLOOR = 2.0  # typical levels; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
-_PSEUDO_WRONG, _PSEUDO_LEVEL = 1.0, 0.05  # pairs added to the count of each share; none may become 0
+_SPREADS = (0.2, 1.3)  # standard deviation of log levels, least (half a step of the grid) and largest
+_PSEUDO_WRONG = 1.0  # pairs added to the wrong ones, whose share may not become 0
 _FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
+_LONGEST = 50.0  # median lengths; e^4, beyond what a spread of lengths of 2 allows for all pairs of a node
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
@@ -69,6 +72,10 @@ _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most 
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
 _TYPICAL = 0.8  # share of the right pairs; the level that so many have at most serves a consensus
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
+_UNKNOWN = 1e-6  # probability of being right; a direction of less has the usual variance
+_MOST_LEVERAGE = 0.999  # share of a residual's variance; nothing but the pair holds such a camera
+_WEIGH_ROUNDS = 3  # of share and variances, at locations that stay
+_TINY = float(np.finfo(np.float64).tiny)
 _LARGEST_VARIANCE = 1.0  # rad^2; a direction that nothing determines has no more
 
 
@@ -144,17 +151,39 @@ class Mixture:
     def improve(self, end: MixtureEnd) -> MixtureEnd:
         """Return the end of most evidence that consensus and descents, in turn, lead to."""
         for _ in range(_MOST_ROUNDS):
-            moved = self._put_by_consensus(end)
+            level = self._typical_level(end)
+            moved = self._put_by_consensus(end, level)
             if np.array_equal(moved, end.locations):
                 break
-            found = self._descend(moved, _NEXT_FLOOR_RAD, end.shares)
+            found = self._descend(moved, min(_NEXT_FLOOR * level, _FIRST_FLOOR_RAD), end.shares)
             if found is None or found.bound <= end.bound + _ROUND_GAIN:
                 break
             end = found
         return end
 
+    def lead(self, end: MixtureEnd, other: MixtureEnd) -> float:
+        """Return by how many nats the bound of one end is above the other's, at the noise of the noisier."""
+        noisier = max(end, other, key=self._typical_level)
+        return self._weigh(end, noisier) - self._weigh(other, noisier)
+
+    def _weigh(self, end: MixtureEnd, noisier: MixtureEnd) -> float:
+        """Return the bound at the locations of an end, with the levels of the right directions of another."""
+        if end is noisier:
+            return end.bound
+        at, shares, bound = self._residuals(end.locations), noisier.shares, -np.inf
+        variances = np.zeros_like(self._own)
+        for _ in range(_WEIGH_ROUNDS):
+            wrong = self._expect(at.errors**2 + variances, shares, 0.0)[2][0] / len(self._own)
+            shares = np.r_[wrong, (1.0 - wrong) / max(noisier.right_share, _TINY) * noisier.shares[1:]]
+            noise = _Noise(shares, 0.0, variances, self._precision(at.lengths))
+            system = self._equations(at, noise)
+            if not self._refactor(system, _DAMPING[1]):
+                return -np.inf
+            bound, variances = self._log_determinant(system, noise) - system.cost, self._propagate(at)
+        return bound
+
     def _descend(self, start: FloatArray, floor: float, shares: FloatArray) -> MixtureEnd | None:
-        at, damping, bound, last = self._residuals(start), _DAMPING[0], -np.inf, None
+        at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
         for _ in range(_MOST_STEPS):
             shares = self._fit(at.errors**2 + variances, shares, floor)
@@ -170,6 +199,23 @@ class Mixture:
             variances, at = self._propagate(at), moved  # the variance of a residual hardly moves in a step
             floor = max(floor * _FALL, float(_LEVELS_RAD[0]))
         return None if last is None else self._judge(*last)
+
+    def _draw_in(self, start: FloatArray) -> FloatArray:
+        """Return a start with the nodes all of whose pairs are very long amid their neighbors.
+
+        Nothing determines such a node, and at the scale of the others the prior of lengths hardly moves it.
+        """
+        edges, n = self._graph.edges, self._graph.num_nodes
+        lengths = np.linalg.norm(differences(start, edges), axis=1)
+        least = np.full(n, np.inf)
+        np.minimum.at(least, edges.ravel(), np.repeat(lengths, 2))
+        far = least > _LONGEST * np.median(lengths)
+        near, start = ~far[edges[:, ::-1]], start.copy()
+        sums, counts = np.zeros_like(start), np.bincount(edges[near], minlength=n)
+        np.add.at(sums, edges[near], start[edges[:, ::-1][near]])
+        far &= counts > 0
+        start[far] = sums[far] / counts[far, None]
+        return start
 
     def _step(
         self, at: _Residuals, noise: _Noise, system: _System, damping: float
@@ -205,31 +251,34 @@ class Mixture:
         return _Residuals(scaled, floored, units, errors * (angles / sines)[:, None])
 
     def _expect(
-        self, expected: FloatArray, shares: FloatArray, floor: float
+        self, expected: FloatArray, shares: FloatArray, floor: float, own: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return information per axis (m, d - 1), log likelihood (m,), sums of the posteriors (K + 1,)."""
         information, likelihood = np.empty_like(expected), np.empty(len(expected))
         sums, weights = np.zeros_like(shares), shares * np.r_[1.0, np.full(len(_LEVELS_RAD), self._peak)]
         levels = np.maximum(_LEVELS_RAD, floor)
-        _expect(expected, self._own, levels**2, weights, (information, likelihood, sums))
+        _expect(expected, self._own if own is None else own, levels**2, weights, (information, likelihood, sums))
         return information, likelihood, sums
 
     def _fit(self, expected: FloatArray, shares: FloatArray, floor: float) -> FloatArray:
         """Return the shares after some rounds of expectation maximization."""
         for _ in range(_FIT_ROUNDS):
-            sums = self._expect(expected, shares, floor)[2]
-            sums += np.r_[_PSEUDO_WRONG, np.full(len(_LEVELS_RAD), _PSEUDO_LEVEL)]
-            last, shares = shares, sums / sums.sum()
+            last, shares = shares, _share_out(self._expect(expected, shares, floor)[2], floor)
             if np.abs(shares - last).max() <= _SETTLED:
                 break
         return shares
 
     def _judge(self, at: _Residuals, noise: _Noise, bound: float) -> MixtureEnd:
         """Return locations with the posterior that each direction is right, and its variance if it is."""
-        shares, tiny = noise.shares, np.finfo(float).tiny
+        shares = noise.shares
         information, likelihood, _ = self._expect(at.errors**2 + noise.variances, shares, 0.0)
         right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
-        variances = np.maximum(right, tiny) / np.maximum(information.mean(axis=1), tiny)
+        usual = np.exp(2.0 * (shares[1:] + _TINY) @ _LOG_LEVELS / (shares[1:] + _TINY).sum()) + self._own
+        variances = (right + _UNKNOWN) / (information + _UNKNOWN / usual).mean(axis=1)
+        left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)  # of an error, without the pair
+        alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
+        likelihood = self._expect((at.errors / left) ** 2, shares, 0.0, self._own + alone)[1]
+        right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
         return MixtureEnd(
             locations=at.locations,
             bound=bound,
@@ -294,11 +343,25 @@ class Mixture:
         variances = np.sum(across * (relative @ across), axis=1) / at.lengths[:, None] ** 2
         return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
 
-    def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
+    def _typical_level(self, end: MixtureEnd) -> float:
         right = np.cumsum(end.shares[1:])
-        level = _LEVELS_RAD[min(np.searchsorted(right, _TYPICAL * right[-1]), len(_LEVELS_RAD) - 1)]
+        return float(_LEVELS_RAD[min(np.searchsorted(right, _TYPICAL * right[-1]), len(_LEVELS_RAD) - 1)])
+
+    def _put_by_consensus(self, end: MixtureEnd, level: float) -> FloatArray:
         odds = np.full(len(self._own), logit(end.right_share))
         return put_by_consensus(self._graph, end.locations, odds, level**2 + self._own.mean(axis=1))
+
+
+def _share_out(sums: FloatArray, floor: float) -> FloatArray:
+    """Return the most likely shares (K + 1,) for sums of the posteriors; none below the floor."""
+    first = max(int(np.searchsorted(_LEVELS_RAD, floor, side="right")) - 1, 0)
+    logs, counts = np.log(np.maximum(_LEVELS_RAD[first:], floor)), sums[first + 1 :] + _TINY
+    mean = float(counts @ logs / counts.sum())
+    spread = np.clip(np.sqrt(counts @ (logs - mean) ** 2 / counts.sum()), *_SPREADS)
+    normal = np.exp(-0.5 * ((logs - mean) / spread) ** 2)
+    right, wrong = float(counts.sum()), float(sums[0]) + _PSEUDO_WRONG
+    shares = np.r_[wrong, np.zeros(first), right / normal.sum() * normal]
+    return np.asarray(shares / (right + wrong))
 
 
 def _excess_logs(lengths: FloatArray) -> FloatArray:

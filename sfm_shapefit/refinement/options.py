@@ -6,7 +6,7 @@ from typing import Literal
 from sfm_shapefit.base.settings import Composed, explained, group, option
 from sfm_shapefit.solver.options import SolverOptions
 
-Objective = Literal["auto", "shapefit", "lud", "mixture"]
+Objective = Literal["auto", "shapefit", "lud"]
 
 
 @explained

@@ -60,10 +60,6 @@ _TIE = 1e-3  # relative difference of costs; a smaller one says nothing where th
 _POINT_LENGTH = 1e-6  # share of the mean length of all pairs; the cameras of a shorter one stand in one place
 _EXPLAINED = 0.9  # share of the pairs; an answer that explains fewer may be a fold, and triangles are asked
 _POORLY_EXPLAINED = 0.35  # share of the pairs; below, posteriors are followed from solve to solve, too
-_NO_MIXTURE = (
-    "; not by a mixture of noise levels: that takes a bare graph, refined, of ten cameras or more that move "
-    "one by one, each in several pairs"
-)
 OPENING_RAD = 0.1
 """Largest width of the kernel, in radians, at which unrefined starts are compared; see `angular`."""
 
@@ -85,6 +81,16 @@ class Start:
     def best(self) -> FloatArray:
         """The refined locations if there are any."""
         return self.locations if self.refined is None else self.refined.locations
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rival:
+    """Another explanation of the directions than the kept one."""
+
+    end: MixtureEnd
+    """Its locations (n, d), in a scale and from an origin of their own, and which directions it explains."""
+    behind: float
+    """Nats of evidence that the kept explanation has more, both at the noise of the noisier of the two."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -122,6 +128,9 @@ class RefinedPlacement:
     """The program at other weights that the locations come from, certified; None where another was kept."""
     variances: FloatArray | None = None
     """(m,) variance per axis of each direction if it is right, rad^2; None where one level serves all."""
+
+    rivals: tuple[Rival, ...] = ()
+    """Where other starts led to under a mixture, most evidence first; the same place as the kept one, often."""
 
     @property
     def collapsed(self) -> bool:
@@ -180,14 +189,8 @@ def refine_starts(
     lud, second = _find_second_start(measured, options.solver.num_threads(), certified)
     apart = None if second is None else disagreement(graph, solved.locations, second)
     normal_solver = _plan_normal_solver(measured, options) if options.refines else None
-    problem, kept, note = _Problem(measured, normal_solver, solved.locations, second, apart), None, ""
-    if options.objective == "mixture":
-        options = replace(options, objective="auto")
-        kept = _find_most_evident(problem, options)
-        note = _NO_MIXTURE
-    if kept is None:
-        kept = _find_best_fit(problem, options)
-        kept = kept._replace(reason=kept.reason + note)
+    problem = _Problem(measured, normal_solver, solved.locations, second, apart)
+    kept = _find_most_evident(problem, options) or _find_best_fit(problem, options)
     moved = _measure_moves(kept.start)
     # To the bit: the certificate is that of these very locations.
     is_as_solved = kept.start.locations is solved.locations and moved[1] == 0.0
@@ -206,6 +209,7 @@ def refine_starts(
         posterior=kept.posterior,
         reweighted=kept.reweighted,
         variances=kept.variances,
+        rivals=kept.rivals,
     )
 
 
@@ -220,6 +224,7 @@ class _Kept(NamedTuple):
     posterior: FloatArray
     reweighted: Reweighted | None
     variances: FloatArray | None = None
+    rivals: tuple[Rival, ...] = ()
 
 
 def _find_best_fit(problem: _Problem, options: PlacementOptions) -> _Kept:
@@ -273,14 +278,18 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
     """Return the end of most evidence under a mixture of noise levels; None if the graph has no such end."""
     measured, plan = problem.measured, problem.normal_solver
     is_bare = measured.evidence is None and measured.num_points == 0
-    if not (is_bare and isinstance(plan, SymbolicFactor) and can_be_reweighted(measured)):
+    if options.objective != "auto" or not (is_bare and isinstance(plan, SymbolicFactor) and can_be_reweighted(measured)):
         return None
     model = Mixture(measured, plan)
     candidates = _descend_from_starts(model, problem, options)
     if not candidates:
         return None
-    best = max(candidates, key=lambda candidate: candidate.end.bound)
+    best = candidates[0]
+    for other in candidates[1:]:
+        best = other if model.lead(other.end, best.end) > 0.0 else best
     end = model.improve(best.end)
+    others = (found.end for found in candidates if found is not best)
+    rivals = sorted((Rival(end=x, behind=model.lead(end, x)) for x in others), key=lambda rival: rival.behind)
     if projected_length(measured.graph, end.locations) <= 0.0:
         return None
     levels = np.array([np.sqrt(np.median(end.variances))])
@@ -293,7 +302,7 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
     if best.reweighted is not None:
         reason += f"; {_say_certified(best.reweighted)}"
     costs = {found.name: -found.end.bound for found in candidates}
-    return _Kept(start, reason, costs, levels, end.posterior, best.reweighted, end.variances)
+    return _Kept(start, reason, costs, levels, end.posterior, best.reweighted, end.variances, tuple(rivals))
 
 
 def _descend_from_starts(model: Mixture, problem: _Problem, options: PlacementOptions) -> list[_Candidate]:
@@ -310,7 +319,7 @@ def _descend_from_starts(model: Mixture, problem: _Problem, options: PlacementOp
         ("ShapeFit at triangles", _by_triangles, _EXPLAINED),
         ("reweighted ShapeFit", _by_posteriors, _POORLY_EXPLAINED),
     ):
-        best = max(candidates, key=lambda candidate: candidate.end.bound).end
+        best = max((candidate.end for candidate in candidates), key=lambda end: end.right_share)
         if best.right_share >= share or (found := weigh(problem, best, options)) is None:
             continue
         reweighted, start = found

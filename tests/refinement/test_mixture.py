@@ -62,13 +62,13 @@ def four_sides(seed, n=120, reach=14, mistaken=0.3):
 def on_street():
     """A street and what the mixture makes of it."""
     made = street(0)
-    return *made, place(made[0], objective="mixture")
+    return *made, place(made[0])
 
 
 @pytest.mark.parametrize(("d", "q"), [(3, 0.6), (3, 0.7), (3, 0.8), (2, 0.4)])
 def test_exact_directions_are_recovered_exactly_and_told_from_wrong_ones(d, q):
     problem = corrupted(q, d, n=100 if q == 0.8 else 60)
-    found = place(problem.view_graph, objective="mixture")
+    found = place(problem.view_graph)
     assert shape_error(found.locations, problem.locations) < 1e-9
     np.testing.assert_array_equal(found.refined.posterior > 0.5, ~problem.corrupted)
     np.testing.assert_array_equal(found.agreement.agrees, ~problem.corrupted)
@@ -80,8 +80,8 @@ def test_a_street_of_uneven_noise_is_placed_about_as_well_as_by_its_right_pairs_
     for seed in range(4):
         graph, truth, is_wrong, _ = street(seed)
         answers = (
-            place(graph, objective="mixture"),
-            place(graph.subset(~is_wrong), objective="mixture"),
+            place(graph),
+            place(graph.subset(~is_wrong)),
             place(graph),
         )
         errors.append([shape_error(found.locations, truth[found.cameras]) for found in answers])
@@ -93,7 +93,7 @@ def test_a_street_of_uneven_noise_is_placed_about_as_well_as_by_its_right_pairs_
 @pytest.mark.parametrize("seed", [0, 1])
 def test_four_equal_sides_are_folded_by_the_usual_way_and_not_by_evidence(seed):
     graph, truth, is_wrong = four_sides(seed)
-    found = place(graph, objective="mixture")
+    found = place(graph)
     assert shape_error(place(graph).locations, truth) > 0.5
     assert shape_error(found.locations, truth) < 0.01
     assert np.mean(found.agreement.agrees == is_wrong) < 0.005
@@ -123,7 +123,7 @@ def test_a_pair_that_a_loose_camera_fits_exactly_is_not_believed_for_that(seed):
         np.concatenate([graph.edges, [(n, ends[0]), (n, ends[1])]]),
         np.concatenate([graph.directions, normalized(rng.normal(size=(2, 2)))]),  # two lines always meet
     )
-    found = place(loose, objective="mixture")
+    found = place(loose)
     assert np.isfinite(found.locations).all()
     assert shape_error(found.locations[:n], problem.locations) < 0.01
     assert not found.agreement.agrees[-2:].any()
@@ -134,7 +134,7 @@ def test_a_pair_that_a_loose_camera_fits_exactly_is_not_believed_for_that(seed):
 def test_the_answer_is_the_same_to_the_bit_for_any_number_of_threads(on_street):
     graph, *_, found = on_street
     for threads in (2, 3):
-        again = place(graph, objective="mixture", threads=threads)
+        again = place(graph, threads=threads)
         np.testing.assert_array_equal(again.locations, found.locations)
         np.testing.assert_array_equal(again.refined.variances, found.refined.variances)
 
@@ -144,7 +144,7 @@ def test_names_and_senses_of_pairs_do_not_matter(on_street):
     rng = np.random.default_rng(0)
     names, order = rng.permutation(graph.num_nodes), rng.permutation(graph.num_edges)
     renamed = ViewGraph(graph.num_nodes, names[graph.edges][order, ::-1], -graph.directions[order])
-    there = place(renamed, objective="mixture")
+    there = place(renamed)
     # Descents end where a step gains less than half a nat: here a quarter of the error, which is 0.019.
     assert shape_error(there.locations[names], found.locations) < 5e-3
     assert np.mean(there.agreement.agrees == found.agreement.agrees[order]) > 0.99
@@ -159,7 +159,7 @@ def test_rigid_groups_and_few_cameras_are_placed_the_usual_way_and_that_is_said(
     inside = np.flatnonzero(np.diff(groups.group_of[problem.view_graph.edges], axis=1)[:, 0] != 0)
     grouped = MeasuredGraph(problem.view_graph.subset(inside), groups=groups)
     for graph in (MeasuredGraph(few), grouped):
-        found, usual = place(graph, objective="mixture"), place(graph)
+        found, usual = place(graph), place(graph)
         np.testing.assert_array_equal(found.locations, usual.locations)
         assert found.refined.reason == usual.refined.reason + starts._NO_MIXTURE
         assert found.refined.variances is None
@@ -170,8 +170,8 @@ def test_standard_deviations_of_the_directions_are_used():
     for seed in (1, 2, 4):
         graph, truth, is_wrong, sigma = street(seed)
         is_known = np.arange(len(sigma)) % 7 > 0
-        found = place(graph, objective="mixture", sigma=np.where(is_known, sigma, np.nan))
-        blind += shape_error(place(graph, objective="mixture").locations, truth)
+        found = place(graph, sigma=np.where(is_known, sigma, np.nan))
+        blind += shape_error(place(graph).locations, truth)
         told += shape_error(found.locations, truth)
         assert (found.refined.variances >= 0.999 * sigma**2)[is_known & ~is_wrong].all()
         assert np.mean((found.refined.posterior > 0.5) == is_wrong) < 0.02
@@ -203,7 +203,7 @@ def test_a_sigma_that_is_none_is_refused(sigma, message, on_street):
 
 
 def test_one_signature_of_the_kernel_serves_all_graphs(on_street):
-    place(corrupted(0.2, 2, n=20).view_graph, objective="mixture")
+    place(corrupted(0.2, 2, n=20).view_graph)
     place(
         MeasuredGraph(on_street[0], covariance=np.tile(1e-4 * np.eye(2), (len(on_street[2]), 1, 1))),
         objective="mixture",
