@@ -210,7 +210,8 @@ def _do_counts_mislead(
         1 + int(connected_components(given.num_cameras, given.pairs[rows]).max())
         for rows in (counted & plain, counted)
     )
-    return bool(np.sum(counted & ~plain) <= _MOST_BY_CHANCE * (num_blocks - num_tied))
+    most = _MOST_BY_CHANCE * (num_blocks - num_tied)
+    return 0 < int(np.sum(counted & ~plain)) <= most
 
 
 def _answers(given: AveragingPairs, subsets: list[BoolArray], threads: int) -> Iterator[_Answer]:
