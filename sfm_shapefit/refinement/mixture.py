@@ -48,35 +48,58 @@ from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.solver.program import adjoint, differences
 
-_LEVELS_RAD = np.geomspace(1e-7, 0.25, 43)
-"""Noise levels, radians, each 1.4 times the last; noise below the first is none, beyond the last
-nothing is known of a direction."""
-_LOG_LEVELS = np.log(_LEVELS_RAD)
+_LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
+_NODES = np.linspace(-4.0, 4.0, 13)  # standard scores of log levels, at which their normal density is summed
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
 _NEXT_FLOOR = 2.0  # typical levels; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
-_SPREADS = (0.2, 1.3)  # standard deviation of log levels, least (half a step of the grid) and largest
+_SPREADS = (0.05, 1.3)  # standard deviation of log levels, least and largest
 _PSEUDO_WRONG = 1.0  # pairs added to the wrong ones, whose share may not become 0
 _FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
-_LONGEST = 50.0  # median lengths; e^4, beyond what a spread of lengths of 2 allows for all pairs of a node
+_LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; beyond two of the largest spreads of lengths
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
 _LEAST_GAIN = 0.5  # nats; a smaller change of the bound is none
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
-_TYPICAL = 0.8  # share of the right pairs; the level that so many have at most serves a consensus
+_TYPICAL = 0.84  # standard score of a log level; the level that four of five have at most
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
 _UNKNOWN = 1e-6  # probability of being right; a direction of less has the usual variance
-_MOST_LEVERAGE = 0.999  # share of a residual's variance; nothing but the pair holds such a camera
+_MOST_LEVERAGE = 0.9  # share of a residual's variance; nothing but the pair holds such a camera
 _WEIGH_ROUNDS = 3  # of share and variances, at locations that stay
 _TINY = float(np.finfo(np.float64).tiny)
 _LARGEST_VARIANCE = 1.0  # rad^2; a direction that nothing determines has no more
+_NODE_SHARES = np.exp(-0.5 * _NODES**2) / np.exp(-0.5 * _NODES**2).sum()
+
+
+class Levels(NamedTuple):
+    """Share and noise of right directions."""
+
+    right: float
+    """Share of the directions that are right."""
+    mean: float
+    """Mean of the log levels, in radians, of these."""
+    spread: float
+    """Their standard deviation."""
+
+    def at_nodes(self, floor: float) -> FloatArray:
+        """Return the levels (K,), radians, ascending, at which their density is summed; none below a floor."""
+        lowest, highest = _LEVELS_RAD
+        return np.clip(np.exp(self.mean + self.spread * _NODES), max(floor, lowest), highest)
+
+    @property
+    def typical(self) -> float:
+        """The level, radians, that four of five right directions have at most."""
+        return float(np.clip(np.exp(self.mean + _TYPICAL * self.spread), *_LEVELS_RAD))
+
+
+_FIRST_LEVELS = Levels(right=0.5, mean=float(np.log(_FIRST_FLOOR_RAD)), spread=1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,13 +114,13 @@ class MixtureEnd:
     """(m,) probability that each direction is right."""
     variances: FloatArray
     """(m,) variance per axis of the error of each direction if it is right, rad^2, own part included."""
-    shares: FloatArray
-    """(K + 1,) shares of wrong directions and of each level."""
+    levels: Levels
+    """Share and noise of the right directions."""
 
     @property
     def right_share(self) -> float:
         """Share of the directions that are right."""
-        return float(1.0 - self.shares[0])
+        return self.levels.right
 
 
 class _Residuals(NamedTuple):
@@ -112,7 +135,7 @@ class _Residuals(NamedTuple):
 class _Noise(NamedTuple):
     """The model of one step."""
 
-    shares: FloatArray  # (K + 1,)
+    levels: Levels
     floor: float  # radians; lower levels count as this one
     variances: FloatArray  # (m, d - 1) rad^2, residuals by the locations
     precision: float  # 1 / variance of a log length in the prior
@@ -145,17 +168,15 @@ class Mixture:
 
     def descend(self, start: FloatArray) -> MixtureEnd | None:
         """Return where a descent from (n, d) locations ends; None if its equations are singular."""
-        count = len(_LEVELS_RAD)
-        return self._descend(start, _FIRST_FLOOR_RAD, np.r_[0.5, np.full(count, 0.5 / count)])
+        return self._descend(start, _FIRST_FLOOR_RAD, _FIRST_LEVELS)
 
     def improve(self, end: MixtureEnd) -> MixtureEnd:
         """Return the end of most evidence that consensus and descents, in turn, lead to."""
         for _ in range(_MOST_ROUNDS):
-            level = self._typical_level(end)
-            moved = self._put_by_consensus(end, level)
+            moved = self._put_by_consensus(end)
             if np.array_equal(moved, end.locations):
                 break
-            found = self._descend(moved, min(_NEXT_FLOOR * level, _FIRST_FLOOR_RAD), end.shares)
+            found = self._descend(moved, min(_NEXT_FLOOR * end.levels.typical, _FIRST_FLOOR_RAD), end.levels)
             if found is None or found.bound <= end.bound + _ROUND_GAIN:
                 break
             end = found
@@ -163,31 +184,30 @@ class Mixture:
 
     def lead(self, end: MixtureEnd, other: MixtureEnd) -> float:
         """Return by how many nats the bound of one end is above the other's, at the noise of the noisier."""
-        noisier = max(end, other, key=self._typical_level)
-        return self._weigh(end, noisier) - self._weigh(other, noisier)
+        noise = max(end.levels, other.levels, key=lambda levels: levels.typical)
+        return self._weigh(end, noise) - self._weigh(other, noise)
 
-    def _weigh(self, end: MixtureEnd, noisier: MixtureEnd) -> float:
-        """Return the bound at the locations of an end, with the levels of the right directions of another."""
-        if end is noisier:
+    def _weigh(self, end: MixtureEnd, levels: Levels) -> float:
+        """Return the bound at the locations of an end, where right directions have such levels."""
+        if end.levels is levels:
             return end.bound
-        at, shares, bound = self._residuals(end.locations), noisier.shares, -np.inf
-        variances = np.zeros_like(self._own)
+        at, bound, variances = self._residuals(end.locations), -np.inf, np.zeros_like(self._own)
         for _ in range(_WEIGH_ROUNDS):
-            wrong = self._expect(at.errors**2 + variances, shares, 0.0)[2][0] / len(self._own)
-            shares = np.r_[wrong, (1.0 - wrong) / max(noisier.right_share, _TINY) * noisier.shares[1:]]
-            noise = _Noise(shares, 0.0, variances, self._precision(at.lengths))
+            sums = self._expect(at.errors**2 + variances, levels, 0.0)[2]
+            levels = levels._replace(right=_right_share(sums))
+            noise = _Noise(levels, 0.0, variances, self._precision(at.lengths))
             system = self._equations(at, noise)
             if not self._refactor(system, _DAMPING[1]):
                 return -np.inf
             bound, variances = self._log_determinant(system, noise) - system.cost, self._propagate(at)
         return bound
 
-    def _descend(self, start: FloatArray, floor: float, shares: FloatArray) -> MixtureEnd | None:
+    def _descend(self, start: FloatArray, floor: float, levels: Levels) -> MixtureEnd | None:
         at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
         for _ in range(_MOST_STEPS):
-            shares = self._fit(at.errors**2 + variances, shares, floor)
-            noise = _Noise(shares, floor, variances, self._precision(at.lengths))
+            levels = self._fit(at.errors**2 + variances, levels, floor)
+            noise = _Noise(levels, floor, variances, self._precision(at.lengths))
             system = self._equations(at, noise)
             moved, damping = self._step(at, noise, system, damping)
             if moved is None:
@@ -197,25 +217,27 @@ class Mixture:
             if floor <= _NOISELESS_RAD and abs(bound - before) < _LEAST_GAIN:
                 break
             variances, at = self._propagate(at), moved  # the variance of a residual hardly moves in a step
-            floor = max(floor * _FALL, float(_LEVELS_RAD[0]))
+            floor = max(floor * _FALL, _LEVELS_RAD[0])
         return None if last is None else self._judge(*last)
 
-    def _draw_in(self, start: FloatArray) -> FloatArray:
-        """Return a start with the nodes all of whose pairs are very long amid their neighbors.
+    def _draw_in(self, t: FloatArray) -> FloatArray:
+        """Return locations with the nodes whose pairs are very long amid their neighbors.
 
         Nothing determines such a node, and at the scale of the others the prior of lengths hardly moves it.
         """
         edges, n = self._graph.edges, self._graph.num_nodes
-        lengths = np.linalg.norm(differences(start, edges), axis=1)
-        least = np.full(n, np.inf)
-        np.minimum.at(least, edges.ravel(), np.repeat(lengths, 2))
-        far = least > _LONGEST * np.median(lengths)
-        near, start = ~far[edges[:, ::-1]], start.copy()
-        sums, counts = np.zeros_like(start), np.bincount(edges[near], minlength=n)
-        np.add.at(sums, edges[near], start[edges[:, ::-1][near]])
+        lengths = np.linalg.norm(differences(t, edges), axis=1)
+        logs = np.log(np.maximum(lengths / max(float(np.median(lengths)), _TINY), _SHORTEST))
+        degrees = self._graph.degrees()
+        far = np.bincount(edges.ravel(), np.repeat(logs, 2), n) > np.log(_LONGEST) * degrees
+        if not far.any():
+            return t
+        others, ends = edges[:, ::-1][near := ~far[edges[:, ::-1]]], edges[near]
+        counts, t = np.bincount(ends, minlength=n), t.copy()
+        sums = np.stack([np.bincount(ends, x[others], n) for x in t.T], axis=1)
         far &= counts > 0
-        start[far] = sums[far] / counts[far, None]
-        return start
+        t[far] = sums[far] / counts[far, None]
+        return t
 
     def _step(
         self, at: _Residuals, noise: _Noise, system: _System, damping: float
@@ -227,7 +249,7 @@ class Mixture:
         right = -adjoint(system.gradient, self._graph.edges, self._graph.num_nodes)
         while damping <= _DAMPING[2]:
             if self._refactor(system, damping):
-                proposed = at.locations + self._factor.solve(right)
+                proposed = self._draw_in(at.locations + self._factor.solve(right))
                 there = self._residuals(proposed)
                 if self._cost(there, noise) < system.cost:
                     return there, max(damping / 10.0, _DAMPING[1])
@@ -251,40 +273,48 @@ class Mixture:
         return _Residuals(scaled, floored, units, errors * (angles / sines)[:, None])
 
     def _expect(
-        self, expected: FloatArray, shares: FloatArray, floor: float, own: FloatArray | None = None
+        self, expected: FloatArray, levels: Levels, floor: float, own: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return information per axis (m, d - 1), log likelihood (m,), sums of the posteriors (K + 1,)."""
         information, likelihood = np.empty_like(expected), np.empty(len(expected))
-        sums, weights = np.zeros_like(shares), shares * np.r_[1.0, np.full(len(_LEVELS_RAD), self._peak)]
-        levels = np.maximum(_LEVELS_RAD, floor)
-        _expect(expected, self._own if own is None else own, levels**2, weights, (information, likelihood, sums))
+        weights = np.r_[1.0 - levels.right, levels.right * self._peak * _NODE_SHARES]
+        sums, levels2 = np.zeros_like(weights), levels.at_nodes(floor) ** 2
+        _expect(expected, self._own if own is None else own, levels2, weights, (information, likelihood, sums))
         return information, likelihood, sums
 
-    def _fit(self, expected: FloatArray, shares: FloatArray, floor: float) -> FloatArray:
-        """Return the shares after some rounds of expectation maximization."""
+    def _fit(self, expected: FloatArray, levels: Levels, floor: float) -> Levels:
+        """Return the levels after some rounds of expectation maximization."""
+        least = np.log(max(floor, _LEVELS_RAD[0]))
         for _ in range(_FIT_ROUNDS):
-            last, shares = shares, _share_out(self._expect(expected, shares, floor)[2], floor)
-            if np.abs(shares - last).max() <= _SETTLED:
+            last, (information, _, sums) = levels, self._expect(expected, levels, floor)
+            counts = sums[1:] + _TINY
+            # The factor by which all levels together fit the errors, and the squares of the scores.
+            factor2 = np.vdot(information, expected) / (expected.shape[1] * counts.sum())
+            mean = np.clip(levels.mean + 0.5 * np.log(max(factor2, _TINY)), least, np.log(_LEVELS_RAD[1]))
+            gain = levels.spread**2 / (levels.spread**2 + 0.5 / expected.shape[1])
+            grown = 1.0 + (counts @ _NODES**2 / counts.sum() - 1.0) / gain
+            spread = np.clip(levels.spread * np.sqrt(max(grown, 0.0)), *_SPREADS)
+            levels = Levels(_right_share(sums), float(mean), float(spread))
+            if np.abs(np.subtract(levels, last)).max() <= _SETTLED:
                 break
-        return shares
+        return levels
 
     def _judge(self, at: _Residuals, noise: _Noise, bound: float) -> MixtureEnd:
         """Return locations with the posterior that each direction is right, and its variance if it is."""
-        shares = noise.shares
-        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, shares, 0.0)
-        right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
-        usual = np.exp(2.0 * (shares[1:] + _TINY) @ _LOG_LEVELS / (shares[1:] + _TINY).sum()) + self._own
+        levels = noise.levels
+        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, levels, 0.0)
+        right = _posterior(levels, likelihood)
+        usual = np.exp(2.0 * levels.mean) + self._own
         variances = (right + _UNKNOWN) / (information + _UNKNOWN / usual).mean(axis=1)
         left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)  # of an error, without the pair
         alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
-        likelihood = self._expect((at.errors / left) ** 2, shares, 0.0, self._own + alone)[1]
-        right = -np.expm1(np.minimum(np.log(shares[0]) - likelihood, 0.0))
+        likelihood = self._expect((at.errors / left) ** 2, levels, 0.0, self._own + alone)[1]
         return MixtureEnd(
             locations=at.locations,
             bound=bound,
-            posterior=right,
+            posterior=_posterior(levels, likelihood),
             variances=np.maximum(variances, _LEVELS_RAD[0] ** 2),
-            shares=shares,
+            levels=levels,
         )
 
     def _precision(self, lengths: FloatArray) -> float:
@@ -293,12 +323,12 @@ class Mixture:
         return float(self._graph.num_nodes / len(logs) / tau**2)
 
     def _cost(self, at: _Residuals, noise: _Noise) -> float:
-        likelihood = self._expect(at.errors**2 + noise.variances, noise.shares, noise.floor)[1]
+        likelihood = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor)[1]
         return _prior_cost(at.lengths, noise.precision) - float(likelihood.sum())
 
     def _equations(self, at: _Residuals, noise: _Noise) -> _System:
         """Return the system of a step in the locations."""
-        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, noise.shares, noise.floor)
+        information, likelihood, _ = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor)
         across, precision = self._across(at), noise.precision
         along = at.units[:, :, None] * at.units[:, None, :]
         blocks = (across * information[:, None, :]) @ across.transpose(0, 2, 1) + precision * along
@@ -343,25 +373,19 @@ class Mixture:
         variances = np.sum(across * (relative @ across), axis=1) / at.lengths[:, None] ** 2
         return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
 
-    def _typical_level(self, end: MixtureEnd) -> float:
-        right = np.cumsum(end.shares[1:])
-        return float(_LEVELS_RAD[min(np.searchsorted(right, _TYPICAL * right[-1]), len(_LEVELS_RAD) - 1)])
-
-    def _put_by_consensus(self, end: MixtureEnd, level: float) -> FloatArray:
+    def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
         odds = np.full(len(self._own), logit(end.right_share))
-        return put_by_consensus(self._graph, end.locations, odds, level**2 + self._own.mean(axis=1))
+        return put_by_consensus(self._graph, end.locations, odds, end.levels.typical**2 + self._own.mean(axis=1))
 
 
-def _share_out(sums: FloatArray, floor: float) -> FloatArray:
-    """Return the most likely shares (K + 1,) for sums of the posteriors; none below the floor."""
-    first = max(int(np.searchsorted(_LEVELS_RAD, floor, side="right")) - 1, 0)
-    logs, counts = np.log(np.maximum(_LEVELS_RAD[first:], floor)), sums[first + 1 :] + _TINY
-    mean = float(counts @ logs / counts.sum())
-    spread = np.clip(np.sqrt(counts @ (logs - mean) ** 2 / counts.sum()), *_SPREADS)
-    normal = np.exp(-0.5 * ((logs - mean) / spread) ** 2)
-    right, wrong = float(counts.sum()), float(sums[0]) + _PSEUDO_WRONG
-    shares = np.r_[wrong, np.zeros(first), right / normal.sum() * normal]
-    return np.asarray(shares / (right + wrong))
+def _right_share(sums: FloatArray) -> float:
+    """Return the most likely share of right directions for sums of the posteriors (K + 1,)."""
+    return float(sums[1:].sum() / (sums.sum() + _PSEUDO_WRONG))
+
+
+def _posterior(levels: Levels, likelihood: FloatArray) -> FloatArray:
+    """Return the probability that each direction is right, from the log likelihood of the mixture (m,)."""
+    return np.asarray(-np.expm1(np.minimum(np.log1p(-levels.right) - likelihood, 0.0)))
 
 
 def _excess_logs(lengths: FloatArray) -> FloatArray:
