@@ -60,9 +60,9 @@ class EpipolarGeometries:
     num_matches: FloatArray | None = None
     """(m,) matches behind each pair; None if the source has no counts."""
     information: FloatArray | None = None
-    """(m, 3, 3) of the rotations, as `average_rotations` takes it; None if the source has none."""
+    """(m, 3, 3) inverse covariances of the rotations, as in `average_rotations`; None if there are none."""
     covariance: FloatArray | None = None
-    """(m, 3, 3) of `to_second`, in its axes, rad^2; only the share across it counts. None if unknown."""
+    """(m, 3, 3) covariances, rad^2, in axes of camera i; only those across `to_second` count. None if unknown."""
 
     def subset(self, rows: Sequence[int]) -> "EpipolarGeometries":
         """Return some of the pairs of the same cameras."""
