@@ -312,7 +312,7 @@ class Mixture:
         return MixtureEnd(
             locations=at.locations,
             bound=bound,
-            posterior=_posterior(levels, likelihood),
+            posterior=np.minimum(right, _posterior(levels, likelihood)),
             variances=np.maximum(variances, _LEVELS_RAD[0] ** 2),
             levels=levels,
         )

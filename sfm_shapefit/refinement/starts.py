@@ -290,13 +290,15 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
     end = model.improve(best.end)
     others = (found.end for found in candidates if found is not best)
     rivals = sorted((Rival(end=x, behind=model.lead(end, x)) for x in others), key=lambda rival: rival.behind)
-    if projected_length(measured.graph, end.locations) <= 0.0:
+    fallback = problem.first if problem.second is None else problem.second
+    right, noise = end.posterior > 0.5, np.sqrt(end.variances)
+    strays = find_strays(measured.graph, fallback, end.locations, right, noise)
+    locations = put_back(fallback, end.locations, strays)
+    if projected_length(measured.graph, locations) <= 0.0:
         return None
     levels = np.array([np.sqrt(np.median(end.variances))])
-    refined = AngularResult(locations=end.locations, levels_rad=levels, cost=-end.bound, iterations=0)
-    start = Start(
-        name=best.name, locations=best.start, refined=refined, reset_nodes=np.empty(0, dtype=np.int64)
-    )
+    refined = AngularResult(locations=locations, levels_rad=levels, cost=-end.bound, iterations=0)
+    start = Start(name=best.name, locations=best.start, refined=refined, reset_nodes=strays)
     of_starts = "the only start" if len(candidates) == 1 else f"most evidence of {len(candidates)} starts"
     reason = f"{of_starts}, which explains {end.right_share:.0%} of the pairs by a mixture of noise levels"
     if best.reweighted is not None:
