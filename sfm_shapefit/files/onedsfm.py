@@ -62,7 +62,7 @@ class EpipolarGeometries:
     information: FloatArray | None = None
     """(m, 3, 3) inverse covariances of the rotations, as in `average_rotations`; None if there are none."""
     covariance: FloatArray | None = None
-    """(m, 3, 3) covariances, rad^2, in axes of camera i; only those across `to_second` count. None if unknown."""
+    """(m, 3, 3) covariances of `to_second`, rad^2; only those across it count. None if unknown."""
 
     def subset(self, rows: Sequence[int]) -> "EpipolarGeometries":
         """Return some of the pairs of the same cameras."""
