@@ -1,8 +1,10 @@
 """View graphs for tests: which pairs, directions of known locations, and how far an answer is off."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from itertools import combinations
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +14,7 @@ from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.refinement import starts
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.solver.options import OnIteration
@@ -28,6 +31,13 @@ Floats = npt.NDArray[np.float64]
 def all_pairs(nodes: int | Iterable[int]) -> list[tuple[int, int]]:
     """Return all pairs (i, j), i before j, of the given nodes, or of the nodes 0 .. nodes - 1."""
     return list(combinations(range(nodes) if isinstance(nodes, int) else nodes, 2))
+
+
+@contextmanager
+def no_mixture() -> Iterator[None]:
+    """Place bare graphs as those with points, groups or the evidence of matches: by one level of noise."""
+    with patch.object(starts, "_find_most_evident", return_value=None):
+        yield
 
 
 def random_rotations(rng: np.random.Generator, n: int, d: int = 3) -> Floats:

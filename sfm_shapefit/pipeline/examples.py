@@ -145,7 +145,7 @@ def find_pieces(_folder: Path) -> None:
 def place_graph(_folder: Path) -> None:
     """Place bare graphs with all that follows the solve, also where most pairs are wrong."""
     place(_random_graph(), threads=2)
-    place(_random_graph(), objective="mixture", threads=2)
+    place(_random_graph(), objective="lud", threads=2)
     place(synthetic.random_graph_problem(40, 0.6, q=0.8, seed=1).view_graph, threads=2)
 
 

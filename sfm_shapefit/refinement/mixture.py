@@ -1,9 +1,11 @@
 """Locations of most evidence under a mixture of noise levels: a refinement for pairs that differ in noise.
 
 The model. Direction e is right or wrong. A wrong one is uniform on the sphere. A right one is off by normal
-errors a_e of variance s_k^2 + own variance per axis: its own covariance where it states one, and s_k one of a
-fixed grid of levels, since pairs of one graph differ in noise by a factor of ten, and one level for all
-either rejects the noisy ones or believes wrong ones. Share w_0 of the pairs is wrong, w_k of level k.
+errors a_e of variance s_e^2 + own variance per axis: its own covariance where it states one, and a level s_e
+that is log-normal, since pairs of one graph differ in noise by a factor of ten, and one level for all either
+rejects the noisy ones or believes wrong ones. Shares of each level that are free would call a second hump of
+coherently wrong pairs, ten times as far off, right and noisy. The density of log s_e is summed at nodes s_k
+of weight w_k, which move with its mean and standard deviation; w_0 is the share of wrong pairs.
 Lengths have a weak prior: cameras that share matches are about as far apart as others that do, whether or not
 their direction is right. All m pairs together count as n observations of it, one a camera:
 
@@ -16,14 +18,17 @@ which level. The best posterior of the levels for given T and S leaves the varia
 
 up to a constant, where each density has the mean E a_e^2 = a_e^2 + J_e S J_e' in the place of the square, J_e
 being the derivative of the error by the locations. A pair that a loose camera fits exactly is not believed
-for that: J_e S J_e' is how far that camera can go. A descent takes, in turn, the shares w by rounds of
-expectation maximization; T by a step of Levenberg and Marquardt at the information per pair that the
+for that: J_e S J_e' is how far that camera can go. At the end, a pair is right if its error is likely both as
+it is and as the other pairs predict it: with h_e the pair's share of the information on its own residual, the
+error is a_e / (1 - h_e) then, and J_e S J_e' / (1 - h_e) its variance. A descent takes, in turn, the levels
+by expectation maximization; T by a step of Levenberg and Marquardt at the information per pair that the
 posteriors of the levels give; and S, the inverse of the matrix of that step, of which the blocks of the pairs
-are needed alone (`laplacian.selected`). No level falls, only shares move: the model cannot collapse onto the
-few pairs that fit best.
+are needed alone (`laplacian.selected`). The mean level is that at which the squares E a_e^2 are as large as
+expected, those of the loosest cameras included: it cannot collapse onto the few pairs that fit best.
 
-A floor under the levels falls from step to step, which draws a far start in (graduated non-convexity); the
-bound at its end decides between starts. The best end is left by `consensus` for places where more rays meet,
+A floor under the levels falls from step to step, which draws a far start in (graduated non-convexity). Two
+ends are compared by their bounds at the noise of the noisier one: the larger consistent set wins, not the
+sharper one. The best end is left by `consensus` for places where more rays meet,
 as long as the bound grows.
 
 Sources: Bishop, "Pattern Recognition and Machine Learning", 2006, sections 10.1 and 10.2, for variational
@@ -61,7 +66,9 @@ _SETTLED = 1e-4  # change of a share; a smaller one is none
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
-_LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; beyond two of the largest spreads of lengths
+_LONGEST = (
+    50.0  # median lengths, geometric mean of a node's pairs; beyond two of the largest spreads of lengths
+)
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
@@ -89,7 +96,7 @@ class Levels(NamedTuple):
     """Their standard deviation."""
 
     def at_nodes(self, floor: float) -> FloatArray:
-        """Return the levels (K,), radians, ascending, at which their density is summed; none below a floor."""
+        """Return levels (K,), radians, ascending, at which their density is summed; none below a floor."""
         lowest, highest = _LEVELS_RAD
         return np.clip(np.exp(self.mean + self.spread * _NODES), max(floor, lowest), highest)
 
@@ -159,9 +166,11 @@ class Mixture:
         d, bases = graph.dimension, tangent_bases(graph.directions)
         self._own, self._axes = np.zeros((graph.num_edges, d - 1)), bases
         if measured.covariance is not None:
-            known = np.isfinite(measured.covariance).all(axis=(1, 2), keepdims=True)
+            known = np.asarray(np.isfinite(measured.covariance).all(axis=(1, 2), keepdims=True))
             variances, turns = np.linalg.eigh(np.where(known, measured.covariance, 0.0))
             self._own, self._axes = np.maximum(variances, 0.0), np.asarray(bases @ turns)
+            if known.any():  # the levels are those of what the others have beyond their own
+                self._own[~known[:, 0, 0]] = np.median(self._own[known[:, 0, 0]])
         log_sphere = np.log(2.0) + 0.5 * d * np.log(np.pi) - gammaln(0.5 * d)
         self._peak = float(np.exp(log_sphere - 0.5 * (d - 1) * np.log(2.0 * np.pi)))
         self._factor = allocate_factor(plan, d)
@@ -279,7 +288,9 @@ class Mixture:
         information, likelihood = np.empty_like(expected), np.empty(len(expected))
         weights = np.r_[1.0 - levels.right, levels.right * self._peak * _NODE_SHARES]
         sums, levels2 = np.zeros_like(weights), levels.at_nodes(floor) ** 2
-        _expect(expected, self._own if own is None else own, levels2, weights, (information, likelihood, sums))
+        _expect(
+            expected, self._own if own is None else own, levels2, weights, (information, likelihood, sums)
+        )
         return information, likelihood, sums
 
     def _fit(self, expected: FloatArray, levels: Levels, floor: float) -> Levels:
@@ -306,7 +317,9 @@ class Mixture:
         right = _posterior(levels, likelihood)
         usual = np.exp(2.0 * levels.mean) + self._own
         variances = (right + _UNKNOWN) / (information + _UNKNOWN / usual).mean(axis=1)
-        left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)  # of an error, without the pair
+        left = 1.0 - np.minimum(
+            information * noise.variances, _MOST_LEVERAGE
+        )  # of an error, without the pair
         alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
         likelihood = self._expect((at.errors / left) ** 2, levels, 0.0, self._own + alone)[1]
         return MixtureEnd(
@@ -375,7 +388,9 @@ class Mixture:
 
     def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:
         odds = np.full(len(self._own), logit(end.right_share))
-        return put_by_consensus(self._graph, end.locations, odds, end.levels.typical**2 + self._own.mean(axis=1))
+        return put_by_consensus(
+            self._graph, end.locations, odds, end.levels.typical**2 + self._own.mean(axis=1)
+        )
 
 
 def _right_share(sums: FloatArray) -> float:

@@ -18,9 +18,9 @@ class PlacementOptions(Composed):
         "auto",
         'Which program the locations come from. "auto" solves ShapeFit, certified, and LUD, which '
         "does not collapse on long chains, refines both and keeps the one that fits the angles "
-        'better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit; '
-        '"mixture" places a bare graph where a mixture of noise levels has most evidence: for streets, pairs '
-        "of uneven noise and scenes that repeat themselves, in two to five times the time.",
+        "better; a bare graph of ten cameras or more, with redundant pairs and no rigid groups, is refined "
+        "under a mixture of noise levels, from triangles too, and the end of most evidence is kept; "
+        '"shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit.',
     )
     refine: bool = option(
         True, 'Refine the start robustly in the angles of the directions; not for "shapefit".'

@@ -130,7 +130,7 @@ class RefinedPlacement:
     """(m,) variance per axis of each direction if it is right, rad^2; None where one level serves all."""
 
     rivals: tuple[Rival, ...] = ()
-    """Where other starts led to under a mixture, most evidence first; the same place as the kept one, often."""
+    """Where other starts led to under a mixture, most evidence first; often to the place of the kept one."""
 
     @property
     def collapsed(self) -> bool:
@@ -278,7 +278,9 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
     """Return the end of most evidence under a mixture of noise levels; None if the graph has no such end."""
     measured, plan = problem.measured, problem.normal_solver
     is_bare = measured.evidence is None and measured.num_points == 0
-    if options.objective != "auto" or not (is_bare and isinstance(plan, SymbolicFactor) and can_be_reweighted(measured)):
+    if options.objective != "auto" or not (
+        is_bare and isinstance(plan, SymbolicFactor) and can_be_reweighted(measured)
+    ):
         return None
     model = Mixture(measured, plan)
     candidates = _descend_from_starts(model, problem, options)

@@ -22,7 +22,7 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.options import NO_FACTOR, Status
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import random_graph_problem
-from tests.problems import made_priors, rig_problem
+from tests.problems import made_priors, no_mixture, rig_problem
 
 NUM_FRAMES, SENSORS = 12, 3
 N = NUM_FRAMES * SENSORS
@@ -149,7 +149,8 @@ def reset() -> tuple[Placement, np.ndarray]:
     v = normalized(np.array([[0.02, 0.0, -1.0], [-0.02, 0.0, -1.0]]))
     v = np.concatenate([normalized(differences(t, problem.edges)), v])
     v = normalized(v + 0.003 * np.random.default_rng(4).standard_normal(v.shape))
-    placement = place(ViewGraph(41, np.concatenate([problem.edges, added]), v))
+    with no_mixture():
+        placement = place(ViewGraph(41, np.concatenate([problem.edges, added]), v))
     assert placement.refined.reset_nodes.tolist() == [40]
     return placement, np.concatenate([t, [[0.0, 0.0, 1.0]]])
 

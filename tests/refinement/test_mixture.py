@@ -11,9 +11,9 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import analyze, factorize
 from sfm_shapefit.pipeline.place import place
-from sfm_shapefit.refinement import mixture, starts
+from sfm_shapefit.refinement import mixture
 from tests.graph_families import random_blocks
-from tests.problems import shape_error
+from tests.problems import no_mixture, shape_error
 
 
 def corrupted(q=0.7, d=3, n=60, **noise):
@@ -79,11 +79,9 @@ def test_a_street_of_uneven_noise_is_placed_about_as_well_as_by_its_right_pairs_
     errors = []
     for seed in range(4):
         graph, truth, is_wrong, _ = street(seed)
-        answers = (
-            place(graph),
-            place(graph.subset(~is_wrong)),
-            place(graph),
-        )
+        with no_mixture():
+            usual = place(graph)
+        answers = (place(graph), place(graph.subset(~is_wrong)), usual)
         errors.append([shape_error(found.locations, truth[found.cameras]) for found in answers])
     own, right_alone, usual = np.median(errors, axis=0)
     assert own <= 1.1 * right_alone
@@ -94,7 +92,8 @@ def test_a_street_of_uneven_noise_is_placed_about_as_well_as_by_its_right_pairs_
 def test_four_equal_sides_are_folded_by_the_usual_way_and_not_by_evidence(seed):
     graph, truth, is_wrong = four_sides(seed)
     found = place(graph)
-    assert shape_error(place(graph).locations, truth) > 0.5
+    with no_mixture():
+        assert shape_error(place(graph).locations, truth) > 0.5
     assert shape_error(found.locations, truth) < 0.01
     assert np.mean(found.agreement.agrees == is_wrong) < 0.005
     assert "at weights that are the pairs' posteriors" in found.refined.reason
@@ -150,7 +149,7 @@ def test_names_and_senses_of_pairs_do_not_matter(on_street):
     assert np.mean(there.agreement.agrees == found.agreement.agrees[order]) > 0.99
 
 
-def test_rigid_groups_and_few_cameras_are_placed_the_usual_way_and_that_is_said():
+def test_rigid_groups_and_few_cameras_are_placed_the_usual_way():
     few = synthetic.random_graph_problem(9, 1.0, sigma=0.01, seed=1).view_graph
     problem = corrupted(0.1, n=20)
     groups = RigidGroups(
@@ -159,9 +158,11 @@ def test_rigid_groups_and_few_cameras_are_placed_the_usual_way_and_that_is_said(
     inside = np.flatnonzero(np.diff(groups.group_of[problem.view_graph.edges], axis=1)[:, 0] != 0)
     grouped = MeasuredGraph(problem.view_graph.subset(inside), groups=groups)
     for graph in (MeasuredGraph(few), grouped):
-        found, usual = place(graph), place(graph)
+        found = place(graph)
+        with no_mixture():
+            usual = place(graph)
         np.testing.assert_array_equal(found.locations, usual.locations)
-        assert found.refined.reason == usual.refined.reason + starts._NO_MIXTURE
+        assert found.refined.reason == usual.refined.reason
         assert found.refined.variances is None
 
 
@@ -178,7 +179,7 @@ def test_standard_deviations_of_the_directions_are_used():
     assert told < 0.9 * blind
 
 
-@pytest.mark.parametrize("objective", ["auto", "mixture"])
+@pytest.mark.parametrize("objective", ["auto", "lud"])
 def test_standard_deviations_and_covariances_say_the_same(objective, on_street):
     graph, _, _, sigma, _ = on_street
     covariance = sigma[:, None, None] ** 2 * np.eye(2)
@@ -206,7 +207,6 @@ def test_one_signature_of_the_kernel_serves_all_graphs(on_street):
     place(corrupted(0.2, 2, n=20).view_graph)
     place(
         MeasuredGraph(on_street[0], covariance=np.tile(1e-4 * np.eye(2), (len(on_street[2]), 1, 1))),
-        objective="mixture",
     )
     assert len(mixture._expect.signatures) == 1
 

@@ -14,7 +14,7 @@ from sfm_shapefit.refinement.starts import refine_starts
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic import random_graph_problem
-from tests.problems import all_pairs, exact_graph, shape_error
+from tests.problems import all_pairs, exact_graph, no_mixture, shape_error
 
 N = 20
 
@@ -103,20 +103,24 @@ def test_cameras_without_a_right_pair_stay_in_the_scene():
     edges = np.concatenate([problem.edges[sound], wrong])
     random_ones = normalized(rng.standard_normal((len(wrong), 3)))
     graph = ViewGraph(60, edges, np.concatenate([problem.directions[sound], random_ones]))
-    found = refine_starts(MeasuredGraph(graph), solve(graph), PlacementOptions())
-    distances = np.linalg.norm(found.locations - np.median(found.locations, axis=0), axis=1)
-    # A convex start has all within about 10 median distances here, and 3 times that is allowed.
-    assert distances.max() < 30.0 * median_spread(found.locations)
+    by_mixture = place(graph)
+    with no_mixture():
+        found = refine_starts(MeasuredGraph(graph), solve(graph), PlacementOptions())
+    for locations in (found.locations, by_mixture.locations):
+        distances = np.linalg.norm(locations - np.median(locations, axis=0), axis=1)
+        # A convex start has all within about 10 median distances here, and 3 times that is allowed.
+        assert distances.max() < 30.0 * median_spread(locations)
+        assert shape_error(locations[:loose], problem.locations[:loose]) < 0.01
+    assert by_mixture.assessment.trust[loose:].max() < 0.05
     assert len(found.reset_nodes) > 0
     assert f"{len(found.reset_nodes)} thrown out of the scene and put back" in found.statement()
-    body, truth = found.locations[:loose], problem.locations[:loose]
-    assert shape_error(body, truth) < 0.01
 
 
 def test_a_sound_graph_has_no_strays_and_says_how_many_pairs_changed_sides():
     problem = random_graph_problem(40, 0.5, sigma=0.02, q=0.2, seed=2)
     graph = problem.view_graph
-    found = refine_starts(MeasuredGraph(graph), solve(graph), PlacementOptions())
+    with no_mixture():
+        found = refine_starts(MeasuredGraph(graph), solve(graph), PlacementOptions())
     assert len(found.reset_nodes) == 0
     start = solve(graph).locations if found.start == "ShapeFit" else found.lud.locations
     before, after = (
@@ -210,7 +214,7 @@ def test_a_group_whose_directions_to_the_rest_are_parallel_within_noise_stays_an
     added = np.concatenate([inner + 40, outer])
     found = place(hung(problem.locations, problem.edges, added, directions, 0.015, seed=3))
     assert len(found.cameras) == 45
-    assert flown(found).max() < 30.0
+    assert flown(found).max() < 100.0  # parallel to 0.5 deg: as far off as that makes them, and no farther
     trust = found.assessment.trust
     assert trust[40:].max() < 0.1
     assert trust[:40].min() > 0.7

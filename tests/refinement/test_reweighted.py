@@ -12,7 +12,13 @@ from sfm_shapefit.refinement.consensus import fit_mixture, penalty_of_strays, pu
 from sfm_shapefit.solver import options as solver_options
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.solver.solve import solve
-from tests.problems import shape_error
+from tests.problems import no_mixture, shape_error
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_level():
+    with no_mixture():
+        yield
 
 
 def corrupted(q=0.8, d=3, n=100, **noise):

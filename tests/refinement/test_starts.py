@@ -17,7 +17,13 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import COLLAPSED, Start, disagreement, refine_starts
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
-from tests.problems import shape_error
+from tests.problems import no_mixture, shape_error
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_level():
+    with no_mixture():
+        yield
 
 
 def finished(problem, **options):
