@@ -17,14 +17,19 @@ Source: Wilson, Snavely, "Robust global translations with 1DSfM", ECCV 2014, and
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import FLIP_YZ, nearest_rotations, normalized, rotation_angles_deg
+from sfm_shapefit.base.geometry import (
+    FLIP_YZ,
+    nearest_rotations,
+    normalized,
+    tangent_bases,
+)
 from sfm_shapefit.files.lines import (
     UNIT_TOLERANCE,
     TextTable,
@@ -33,6 +38,7 @@ from sfm_shapefit.files.lines import (
     read_lines,
     rotations_by_name,
 )
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 
 _PAIRS_FILE, _COMPONENT_FILE = "EGs.txt", "cc.txt"
@@ -51,18 +57,19 @@ class EpipolarGeometries:
     """(m, 3, 3) cam_j_from_cam_i."""
     to_second: FloatArray
     """(m, 3) unit directions to camera j in the axes of camera i."""
+    num_matches: FloatArray | None = None
+    """(m,) matches behind each pair; None if the source has no counts."""
+    information: FloatArray | None = None
+    """(m, 3, 3) inverse covariances of the rotations, as in `average_rotations`; None if there are none."""
+    covariance: FloatArray | None = None
+    """(m, 3, 3) covariances of `to_second`, rad^2; only those across it count. None if unknown."""
 
     def subset(self, rows: Sequence[int]) -> "EpipolarGeometries":
         """Return some of the pairs of the same cameras."""
-        pairs, rotations, to_second = self.pairs[rows], self.rotations[rows], self.to_second[rows]
-        return replace(self, pairs=pairs, rotations=rotations, to_second=to_second)
+        columns = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "names"}
+        return replace(self, **{name: value[rows] for name, value in columns.items() if value is not None})
 
-    def mismatch_deg(self, rotations: FloatArray) -> FloatArray:
-        """Return the angles (m,), degrees, between relative rotations and those of the cameras' (n, 3, 3)."""
-        i, j = self.pairs.T
-        return rotation_angles_deg(self.rotations @ rotations[i] @ rotations[j].swapaxes(1, 2))
-
-    def view_graph(self, rotations: FloatArray, known: BoolArray) -> ViewGraph:
+    def measured(self, rotations: FloatArray, known: BoolArray) -> MeasuredGraph:
         """Return the directions in world axes of all pairs both of whose cameras have a rotation.
 
         Args:
@@ -75,9 +82,13 @@ class EpipolarGeometries:
         joined = known[self.pairs].all(axis=1)
         if not joined.any():
             raise InputError("no pair joins two cameras that have a rotation; check the rotations' ids")
-        i = self.pairs[joined, 0]
-        to_first = -np.einsum("eba,eb->ea", rotations[i], self.to_second[joined])
-        return ViewGraph(len(self.names), self.pairs[joined], normalized(to_first), names=self.names)
+        world_from_first = rotations[self.pairs[joined, 0]].swapaxes(1, 2)
+        to_first = -np.einsum("eab,eb->ea", world_from_first, self.to_second[joined])
+        graph = ViewGraph(len(self.names), self.pairs[joined], normalized(to_first), names=self.names)
+        if self.covariance is None:
+            return MeasuredGraph(graph)
+        across = world_from_first.swapaxes(1, 2) @ tangent_bases(graph.directions)
+        return MeasuredGraph(graph, covariance=across.swapaxes(1, 2) @ self.covariance[joined] @ across)
 
 
 def geometries_of(

@@ -116,6 +116,10 @@ class MeasuredGraph:
         graph, nodes = self.graph.restricted_to(rows)
         return self._with_rows(graph, rows, nodes), nodes
 
+    def subset(self, rows: IntArray) -> "MeasuredGraph":
+        """Return what was measured of the same nodes by the edges `rows`."""
+        return self._with_rows(self.graph.subset(rows), rows, np.arange(self.graph.num_nodes))
+
     def without_points(self) -> "MeasuredGraph":
         """Return what was measured of all cameras alone, with the numbers that they have."""
         if self.num_points == 0:

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.result import GraphResult
@@ -24,6 +25,7 @@ from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.placement.place import place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.posterior import weigh_by_triangles
 from sfm_shapefit.rotations.average import average_rotations
 from sfm_shapefit.solver.options import OnIteration
 
@@ -38,6 +40,8 @@ def place(
     options: PlacementOptions | None = None,
     *,
     sigma: npt.ArrayLike | None = None,
+    rotations: npt.ArrayLike | None = None,
+    num_matches: npt.ArrayLike | None = None,
     on_iteration: OnIteration | None = None,
     **overrides: Any,
 ) -> PlacedGraph:
@@ -51,26 +55,68 @@ def place(
     collapses on long chains and under heavy corruption.
 
     Args:
-        measured: any view graph with at least one edge, or its text file, best with what is known of its
-            directions; what its largest rigid piece leaves out is not placed.
+        measured: any view graph with at least one edge, or a file as `place_graph_file` takes it, best with
+            what is known of its directions; what its largest rigid piece leaves out is not placed.
         options: settings, see `help(PlacementOptions)`; defaults if None.
         sigma: (m,) standard deviation of each direction per axis, radians, or (m, d - 1, d - 1) covariances
             in `tangent_bases(graph.directions)`, rad^2; NaN where unknown, None if all are. Noise that the
             residuals show beyond it is added.
+        rotations: (m, 3, 3) cam_j_from_cam_i of each edge (i, j). They are averaged, and pairs off the
+            averaged ones by more than 10 degrees leave the graph: repeated structure often turns a pair whose
+            direction agrees with those of other false ones.
+        num_matches: (m,) matches behind each of these rotations, see `average_rotations`. If None, all count
+            alike, and no pair leaves if the directions of most such pairs close triangles: then the averaged
+            rotations are those of a folded scene.
         on_iteration: as of `place_pieces`.
         **overrides: single options by name: `place(graph, refine=False)`.
 
     Raises:
-        InputError: if sigma has another shape, or negative or infinite values; else as `place_pieces`.
+        InputError: if sigma has another shape, or negative or infinite values, or if all rotations contradict
+            one another; else as `average_rotations` and `place_pieces`.
         UnsolvableError: as `place_pieces`.
     """
     options = merge_options(options, PlacementOptions, overrides)
-    measured = read_graph(measured) if isinstance(measured, Path | str) else measured
+    threads = options.solver.num_threads()
+    if isinstance(measured, Path | str):
+        poses = _relative_poses(measured)
+        measured = read_graph(measured) if poses is None else _orient(poses, None, threads=threads)[0]
     graph = MeasuredGraph(measured) if isinstance(measured, ViewGraph) else measured
     if sigma is not None:
         graph = replace(graph, covariance=_covariances(graph.graph, sigma))
+    if rotations is not None:
+        graph = _without_contradicted(graph, rotations, num_matches, threads)
+    elif num_matches is not None:
+        raise InputError("num_matches say how much relative rotations count; give rotations, too")
     placed = next(place_pieces(graph, options, on_iteration=on_iteration))
     return PlacedGraph.of(judge(placed, options), options)
+
+
+def _without_contradicted(
+    measured: MeasuredGraph, rotations: npt.ArrayLike, num_matches: npt.ArrayLike | None, threads: int
+) -> MeasuredGraph:
+    """Return what was measured of the pairs whose relative rotations agree with the averaged ones."""
+    graph = measured.graph
+    averaged = average_rotations(
+        graph.edges, rotations, num_images=graph.num_nodes, weights=num_matches, threads=threads
+    )
+    relative = np.asarray(rotations, dtype=np.float64)
+    agree = _agree(graph.edges, relative, averaged.rotations, MAX_ROTATION_ERROR_DEG)
+    leave = averaged.registered[graph.edges].all(axis=1) & ~agree
+    if num_matches is None and leave.any() and np.mean(weigh_by_triangles(graph).log_odds[leave] > 0.0) > 0.5:
+        return measured
+    return measured.subset(np.flatnonzero(~leave))
+
+
+def _agree(pairs: IntArray, relative: FloatArray, rotations: FloatArray, most_deg: float) -> BoolArray:
+    """Return which relative rotations of pairs (m, 2) agree with those of the cameras (n, 3, 3), (m,)."""
+    i, j = pairs.T
+    agree = rotation_angles_deg(relative @ rotations[i] @ rotations[j].swapaxes(1, 2)) <= most_deg
+    if not agree.any():
+        raise InputError(
+            f"none of the {len(pairs)} relative rotations agrees with those of the cameras; "
+            "check that they belong together"
+        )
+    return np.asarray(agree)
 
 
 def _covariances(graph: ViewGraph, sigma: npt.ArrayLike) -> FloatArray:
@@ -128,17 +174,18 @@ def place_graph_file(
         if reverse:
             raise InputError(f"{path} holds relative poses, whose sense is known; leave out reverse=True")
         with clock("rotations"):
-            graph, statement = _orient(geometries, rotations, max_rotation_error_deg, clock.threads)
+            graph, statement = _orient(geometries, rotations, max_rotation_error_deg, threads=clock.threads)
     else:
         assert isinstance(path, Path | str)
         if rotations is not None:
             raise InputError(f"{path} is a bare graph of directions, which need no rotations; leave them out")
         with clock("read"):
-            graph = read_graph(path)
+            bare = read_graph(path)
         if reverse:
-            graph = ViewGraph(graph.num_nodes, graph.edges, -graph.directions, graph.weights, graph.names)
+            bare = ViewGraph(bare.num_nodes, bare.edges, -bare.directions, bare.weights, bare.names)
+        graph = MeasuredGraph(bare)
     with clock("solve"):
-        placed = list(place_pieces(MeasuredGraph(graph), options, on_iteration=clock.iteration))
+        placed = list(place_pieces(graph, options, on_iteration=clock.iteration))
     with clock("trust"):
         judged = [judge(piece, options) for piece in placed]
     return GraphResult(
@@ -163,27 +210,34 @@ def _relative_poses(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeomet
 
 
 def _orient(
-    geometries: EpipolarGeometries, path: Path | str | None, max_rotation_error_deg: float, threads: int
-) -> tuple[ViewGraph, str]:
+    poses: EpipolarGeometries,
+    path: Path | str | None,
+    max_rotation_error_deg: float = MAX_ROTATION_ERROR_DEG,
+    *,
+    threads: int,
+) -> tuple[MeasuredGraph, str]:
     """Return the directions of the pairs that agree with the rotations, of a file or averaged."""
     if path is not None:
         read = read_g2o_rotations if is_g2o(path) else read_rotations
-        (rotations, known), origin = read(path, geometries.names), f"of {path}"
+        (rotations, known), origin = read(path, poses.names), f"of {path}"
     else:
-        total = len(geometries.names)
         averaged = average_rotations(
-            geometries.pairs, geometries.rotations, num_images=total, threads=threads
+            poses.pairs,
+            poses.rotations,
+            poses.information,
+            num_images=len(poses.names),
+            weights=poses.num_matches,
+            threads=threads,
         )
         rotations, known, origin = averaged.rotations, averaged.registered, "averaged"
-    agreeing = np.flatnonzero(geometries.mismatch_deg(rotations) <= max_rotation_error_deg)
-    total, kept = len(geometries.pairs), len(agreeing)
-    if kept == 0:
-        raise InputError(
-            f"none of the {total} relative rotations agrees with those of the cameras; "
-            "check that they belong together"
-        )
+        if averaged.counts_mislead:
+            origin += " without numbers of matches, with which fewer pairs agree"
+        elif poses.num_matches is not None:
+            origin += " by the numbers of matches"
+    agreeing = np.flatnonzero(_agree(poses.pairs, poses.rotations, rotations, max_rotation_error_deg))
+    total, kept = len(poses.pairs), len(agreeing)
     statement = (
         f"{int(np.sum(known))} of {len(known)} rotations {origin}; {total - kept} of {total} pairs "
         f"contradict them by more than {max_rotation_error_deg:g} deg and are left out"
     )
-    return geometries.subset(agreeing.tolist()).view_graph(rotations, known), statement
+    return poses.subset(agreeing.tolist()).measured(rotations, known), statement

@@ -32,6 +32,8 @@ class AveragedRotations(Displayed):
     """Pairs whose residuals count in the answer."""
     num_tried: int = 1
     """How many answers it was chosen from."""
+    counts_mislead: bool = False
+    """Whether numbers of matches were set aside, with which fewer pairs agree; see `rotations.average`."""
     num_repeated: int = 0
     """Pairs that most matches speak for, and that are set aside as repeated structure, see `arrangements`."""
     num_rivals: int = 0
@@ -67,6 +69,8 @@ class AveragedRotations(Displayed):
     def statement(self) -> str:
         """How the rotations were found, for the user."""
         tried = f", the most consistent of {self.num_tried} tried" if self.num_tried > 1 else ""
+        if self.counts_mislead:
+            tried += ", without numbers of matches, with which fewer pairs agree"
         text = (
             f"averaged over {self.num_pairs} pairs{tried}; {self.share:.0%} of the pairs' weight agrees "
             f"within {AGREEMENT_DEG:g} deg"

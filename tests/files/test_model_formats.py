@@ -23,7 +23,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.other_programs import reconstruction_of, relative_poses_of
-from sfm_shapefit.files.glomap_text import read_relative_poses
+from sfm_shapefit.files.glomap_text import is_relative_poses, read_relative_poses
 from sfm_shapefit.files.nerf import nerf_text
 from sfm_shapefit.files.opensfm import read_opensfm
 from sfm_shapefit.files.tum import poses_csv, tum_text
@@ -231,7 +231,8 @@ def test_a_pose_graph_gives_the_same_relative_poses():
     graph = pycolmap.PoseGraph()
     for (i, j), rotation, unit in zip(pairs.tolist(), rotations, units, strict=True):
         edge = pycolmap.PoseGraphEdge(
-            cam2_from_cam1=pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -3.0 * rotation @ unit)
+            cam2_from_cam1=pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -3.0 * rotation @ unit),
+            num_matches=10 * i + j,
         )
         graph.add_edge(i + 1, j + 1, edge)
     poses = relative_poses_of(graph)
@@ -239,6 +240,24 @@ def test_a_pose_graph_gives_the_same_relative_poses():
     np.testing.assert_array_equal(poses.pairs, pairs)
     assert rotation_angles_deg(poses.rotations.transpose(0, 2, 1) @ rotations).max() < 1e-6
     np.testing.assert_allclose(poses.to_second, units, atol=1e-12)
+    np.testing.assert_array_equal(poses.num_matches, pairs @ [10, 1])
+    pose = edge.cam2_from_cam1
+    graph.update_edge(i + 1, j + 1, pycolmap.PoseGraphEdge(cam2_from_cam1=pose, num_matches=0))
+    assert relative_poses_of(graph).num_matches is None
+
+
+def test_a_tenth_word_of_relative_poses_counts_matches(tmp_path):
+    lines = ["a b 1 0 0 0 1 0 0 50", "b c 1 0 0 0 0 1 0 7"]
+    (tmp_path / "pairs.txt").write_text("\n".join(lines))
+    assert is_relative_poses(tmp_path / "pairs.txt")
+    assert read_relative_poses(tmp_path / "pairs.txt").num_matches.tolist() == [50.0, 7.0]
+    for line, message in [
+        ("a c 1 0 0 0 0 0 1", "line 3: has 9 columns, expected 10"),
+        ("a c 1 0 0 0 0 0 1 0", "line 3: has no positive number of matches"),
+    ]:
+        (tmp_path / "pairs.txt").write_text("\n".join([*lines, line]))
+        with pytest.raises(InputError, match=message):
+            read_relative_poses(tmp_path / "pairs.txt")
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity, normalized, tangent_bases
 from sfm_shapefit.files.g2o import is_g2o, read_g2o, read_g2o_rotations
 from sfm_shapefit.files.onedsfm import is_onedsfm, read_onedsfm, read_rotations
 from sfm_shapefit.pipeline.place import place_graph_file
@@ -54,7 +54,7 @@ def test_directions_in_world_axes_point_to_the_first_camera_and_camera_axes_beco
     folder, rotations, centers = write_scene(tmp_path)
     found = read_onedsfm(folder)
     cam_from_world, all_known = read_rotations(folder / "rots.txt", found.names)
-    graph = found.view_graph(cam_from_world, all_known)
+    graph = found.measured(cam_from_world, all_known).graph
     i, j = graph.edges.T
     assert graph.names == ("0", "10", "20", "30", "40", "50")
     np.testing.assert_allclose(graph.directions, normalized(centers[i] - centers[j]), atol=1e-12)
@@ -68,7 +68,7 @@ def test_directions_in_world_axes_point_to_the_first_camera_and_camera_axes_beco
 def test_cameras_without_rotation_have_no_directions_and_the_format_is_told_from_bare_graphs(tmp_path):
     folder, _, _ = write_scene(tmp_path, num_rotations=4)
     found = read_onedsfm(folder)
-    graph = found.view_graph(*read_rotations(folder / "rots.txt", found.names))
+    graph = found.measured(*read_rotations(folder / "rots.txt", found.names)).graph
     assert graph.degrees().tolist() == [3, 3, 3, 3, 0, 0]
     folder_with(folder, graph="0 1 1 0 0\n1 2 0 1 0\n", wide="0 1 1" + " 0" * 11 + "\n")
     assert is_onedsfm(folder)
@@ -153,7 +153,7 @@ def test_the_edges_of_a_g2o_file_are_relative_poses_and_its_vertices_rotations(t
     rotations, known = read_g2o_rotations(file, poses.names)
     assert known.all()
     np.testing.assert_allclose(rotations, cam_from_world, atol=1e-14)
-    graph = poses.view_graph(rotations, known)
+    graph = poses.measured(rotations, known).graph
     np.testing.assert_allclose(graph.directions, normalized(centers[i] - centers[j]), atol=1e-12)
 
 
@@ -169,9 +169,76 @@ def test_a_g2o_file_is_solved_from_the_rotations_of_its_vertices(tmp_path):
     np.testing.assert_allclose(placed / np.linalg.norm(placed), true / np.linalg.norm(true), atol=1e-6)
 
 
+def g2o_with(path, information, length=1.0):
+    """Write all pairs of a scene, the k-th with the 6 x 6 matrix information(k); return what is read."""
+    cam_from_world, centers = scene()
+    lines = edges_text(cam_from_world, centers).splitlines()
+    for k, line in enumerate(lines):
+        words, seen = line.split(), np.array(line.split()[3:6], dtype=float)
+        words[3:6] = [repr(x) for x in (length * seen / np.linalg.norm(seen)).tolist()]
+        lines[k] = " ".join([*words, *map(repr, information(k)[np.triu_indices(6)].tolist())])
+    path.write_text("\n".join(lines))
+    return read_g2o(path), cam_from_world, centers
+
+
+def random_information(k):
+    matrix = np.random.default_rng(k).standard_normal((6, 6))
+    return matrix @ matrix.T + np.eye(6)
+
+
+def test_information_of_a_g2o_file_is_that_of_rotations_and_of_directions_of_length_1(tmp_path):
+    poses, cam_from_world, _ = g2o_with(tmp_path / "graph.g2o", random_information)
+    graph = poses.measured(cam_from_world, np.ones(6, dtype=bool))
+    bases = tangent_bases(graph.graph.directions)
+    for k, (_, j) in enumerate(poses.pairs):
+        covariance = np.linalg.inv(random_information(k))  # in axes of camera j
+        np.testing.assert_allclose(np.linalg.inv(poses.information[k]), covariance[3:, 3:], rtol=1e-9)
+        across = cam_from_world[j] @ bases[k]
+        np.testing.assert_allclose(graph.covariance[k], across.T @ covariance[:3, :3] @ across, rtol=1e-9)
+    metric, *_ = g2o_with(tmp_path / "graph.g2o", random_information, length=3.0)
+    assert metric.covariance is None
+    np.testing.assert_array_equal(metric.information, poses.information)
+
+
+def test_rotations_are_averaged_with_the_information_of_a_g2o_file(tmp_path):
+    """Three loose pairs turn camera 0, the first of all its pairs, by 2 degrees; two tight ones do not."""
+
+    def loose_for_three(k):
+        return np.eye(6) / np.radians(2.0 if k < 3 else 0.05) ** 2
+
+    file, errors = tmp_path / "graph.g2o", []
+    _, _, centers = g2o_with(file, loose_for_three, length=2.0)
+    rows = [line.split() for line in file.read_text().splitlines()]
+    turn = Rotation.from_rotvec([np.radians(2.0), 0.0, 0.0])
+    for row in rows[:3]:
+        row[6:10] = map(repr, (turn * Rotation.from_quat([float(x) for x in row[6:10]])).as_quat().tolist())
+    for width in (10, 31):
+        file.write_text("\n".join(" ".join(row[:width]) for row in rows))
+        found = place_graph_file(file).placement.locations
+        errors.append(np.linalg.norm(fit_similarity(found, centers).apply(found) - centers, axis=1).max())
+    # With the floor of the variances, the weights of the five pairs leave 3 / (3 + 40^2) of the turn.
+    assert errors[1] < 0.01 * errors[0]
+
+
+@pytest.mark.parametrize("information", [np.eye(6), 1e4 * np.eye(6), np.zeros((6, 6)), -np.eye(6)])
+def test_information_that_is_a_placeholder_changes_no_bit(tmp_path, information):
+    def alike(k):
+        return information * (1.0 if np.trace(information) > 0.0 else 1.0 + k)
+
+    poses, *_ = g2o_with(tmp_path / "graph.g2o", alike)
+    assert poses.information is None
+    assert poses.covariance is None
+    (tmp_path / "bare.g2o").write_text(
+        "\n".join(" ".join(line.split()[:10]) for line in (tmp_path / "graph.g2o").read_text().splitlines())
+    )
+    found, bare = (place_graph_file(tmp_path / name) for name in ("graph.g2o", "bare.g2o"))
+    np.testing.assert_array_equal(found.placement.locations, bare.placement.locations)
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [
+        (f"EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 1{' 1' * 20} x", "line 2: 'x' is not a number"),
         ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0", "line 2: has 9 columns, expected 10"),
         ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 1 5 5", "line 2: has 12 columns, expected 10"),
         ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 x", "line 2: 'x' is not a number"),
@@ -184,7 +251,7 @@ def test_a_g2o_file_is_solved_from_the_rotations_of_its_vertices(tmp_path):
     ],
 )
 def test_malformed_edges_of_g2o_are_refused_by_line(tmp_path, line, words):
-    (tmp_path / "graph.g2o").write_text(f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1\n{line}\n")
+    (tmp_path / "graph.g2o").write_text(f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1{' 1' * 21}\n{line}\n")
     with pytest.raises(InputError, match=words):
         read_g2o(tmp_path / "graph.g2o")
 

@@ -7,7 +7,10 @@ from itertools import chain
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+import sfm_shapefit
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity, normalized
 from sfm_shapefit.files.graph_text import graph_text, read_graph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -15,6 +18,7 @@ from sfm_shapefit.pipeline.place import place_graph_file
 from sfm_shapefit.synthetic import random_graph_problem
 from tests.files.test_onedsfm_format import egs_text, folder_with, rots_text, scene, write_scene
 from tests.program import run
+from tests.repeated_scenes import four_alike_sides
 from tests.scenes import BUNDLED, real_scene, rows_of
 
 
@@ -116,6 +120,69 @@ def test_every_objective_writes_the_same_files_with_a_certificate(tmp_path, obje
     assert worst_error(order, problem.locations) < 0.01  # noise of 0.001
     assert facts["solve"]["status"] == "converged"
     assert all(row["dual_norm"] != "" for row in rows_of(tmp_path / "out" / "pairs.csv"))
+
+
+@pytest.mark.parametrize("confused", [0.5, 0.8])
+def test_relative_rotations_unfold_a_scene_of_four_equal_sides(confused):
+    scene = four_alike_sides(confused, seed=2)
+    bare = sfm_shapefit.place(scene.graph)
+    placed = sfm_shapefit.place(scene.graph, rotations=scene.relative, num_matches=scene.num_matches)
+    assert worst_error(bare.locations, scene.centers[bare.cameras]) > 0.1
+    assert len(placed.cameras) == len(scene.centers)
+    # Noise of 0.002 a direction, of pairs as long as half the radius, 14 a camera.
+    assert worst_error(placed.locations, scene.centers) < 0.005
+    assert np.isin(placed.graph.edges, scene.graph.edges[scene.num_matches == 200]).all()
+
+
+def test_no_pair_leaves_where_rotations_alone_would_fold_the_scene():
+    scene = four_alike_sides(0.3, seed=0)
+    folded = sfm_shapefit.average_rotations(scene.graph.edges, scene.relative)
+    assert folded.share > np.mean(scene.num_matches == 200)
+    placed = sfm_shapefit.place(scene.graph, rotations=scene.relative)
+    assert placed.graph.num_edges == scene.graph.num_edges
+    assert worst_error(placed.locations, scene.centers) < 0.005
+
+
+def test_rotations_that_agree_change_no_bit_and_bad_ones_are_refused():
+    problem = random_graph_problem(14, 0.9, sigma=0.001, seed=5)
+    graph, same = problem.view_graph, np.tile(np.eye(3), (problem.view_graph.num_edges, 1, 1))
+    plain, given = sfm_shapefit.place(graph), sfm_shapefit.place(graph, rotations=same)
+    np.testing.assert_array_equal(given.locations, plain.locations)
+    for words, options in [
+        ("rotations have shape", {"rotations": same[1:]}),
+        ("has no rotation matrix", {"rotations": 2.0 * same}),
+        ("weights have shape", {"rotations": same, "num_matches": [1.0]}),
+        ("give rotations, too", {"num_matches": np.ones(graph.num_edges)}),
+    ]:
+        with pytest.raises(InputError, match=words):
+            sfm_shapefit.place(graph, **options)
+
+
+def relative_poses_text(scene, counts):
+    """GLOMAP's text of a scene, with a count of matches behind each line or without."""
+    lines = []
+    toward = -np.einsum("eab,eb->ea", scene.rotations[scene.graph.edges[:, 0]], scene.graph.directions)
+    for (i, j), turn, to_second, count in zip(
+        scene.graph.edges, scene.relative, toward, scene.num_matches, strict=True
+    ):
+        numbers = [*np.roll(Rotation.from_matrix(turn).as_quat(), 1), *(-turn @ to_second)]
+        lines.append(f"{i} {j} {' '.join(map(repr, map(float, numbers)))}{f' {count}' if counts else ''}\n")
+    return "".join(lines)
+
+
+def test_counts_behind_relative_poses_unfold_a_scene_and_are_told(tmp_path):
+    scene, found = four_alike_sides(0.5, seed=1), []
+    for counts in (False, True):
+        (tmp_path / "poses.txt").write_text(relative_poses_text(scene, counts))
+        solve(tmp_path / "poses.txt", tmp_path / f"out{counts}")
+        centers = centers_of(tmp_path / f"out{counts}")
+        truth = scene.centers[[int(name) for name in centers]]
+        found.append(worst_error(np.array(list(centers.values())), truth))
+    folded, right = found
+    assert folded > 0.1
+    assert right < 0.005
+    facts = json.loads((tmp_path / "outTrue" / "locate.json").read_text())
+    assert "48 of 48 rotations averaged by the numbers of matches" in facts["inputs"]["directions"]
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas, residu
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
 from sfm_shapefit.synthetic import box_graph_problem, expander_graph_problem, ring_graph_problem
 from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
+from tests.repeated_scenes import four_alike_sides
 
 FAMILIES = {
     "ring": ring_graph_problem(300, 12.0, seed=1),
@@ -156,6 +157,46 @@ def test_the_most_consistent_of_several_averagings_is_kept():
     assert answer.num_tried > 1
     assert answer.num_pairs > 0.9 * len(relative.pairs)
     assert errors_deg(answer.rotations, problem.rotations).max() == pytest.approx(90.0, abs=1.0)
+
+
+def streets_tied_by_weak_pairs(seed):
+    """Six streets of six cameras in a row: six right pairs of few matches between two, one wrong of many."""
+    rng, k = np.random.default_rng(seed), np.arange(36) // 6
+    truth = Rotation.random(36, random_state=rng)
+    pairs = np.column_stack(np.triu_indices(36, 1))
+    apart = k[pairs[:, 1]] - k[pairs[:, 0]]
+    inside, far = np.flatnonzero(apart == 0), np.flatnonzero(apart > 1)
+    between = [rng.choice(np.flatnonzero((apart == 1) & (k[pairs[:, 0]] == b)), 7, False) for b in range(5)]
+    weak, strong = np.concatenate([rows[:6] for rows in between]), np.array([rows[6] for rows in between])
+    wrong = np.concatenate([strong, rng.choice(far, 30, False)])
+    matches = np.full(len(pairs), 60)
+    matches[weak], matches[strong] = 20, 300
+    noise = Rotation.from_rotvec(np.radians(0.2) * rng.standard_normal((len(pairs), 3)))
+    relative = (noise * truth[pairs[:, 1]] * truth[pairs[:, 0]].inv()).as_matrix()
+    relative[wrong] = Rotation.random(len(wrong), random_state=rng).as_matrix()
+    used = np.concatenate([inside, weak, wrong])
+    return pairs[used], relative[used], matches[used], truth.as_matrix()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_counts_are_set_aside_where_a_few_pairs_of_many_matches_turn_whole_streets(seed):
+    pairs, relative, matches, truth = streets_tied_by_weak_pairs(seed)
+    answer = average_rotations(pairs, relative, weights=matches)
+    assert answer.counts_mislead
+    assert "without numbers of matches" in answer.statement
+    # 0.2 deg a pair and axis; a street hangs on six pairs, five of them in a row, and each camera on five.
+    assert errors_deg(answer.rotations, truth).max() < 2.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_counts_are_kept_where_more_pairs_close_in_a_folded_scene(seed):
+    scene = four_alike_sides(0.5, seed)
+    answer = average_rotations(scene.graph.edges, scene.relative, weights=scene.num_matches)
+    folded = average_rotations(scene.graph.edges, scene.relative)
+    right = scene.num_matches == scene.num_matches.max()
+    assert folded.share > np.mean(right) + 0.1
+    assert not answer.counts_mislead
+    assert errors_deg(answer.rotations, scene.rotations).max() < 1.0  # 0.1 deg a pair, some 14 a camera
 
 
 def test_a_common_turn_turns_the_answer_and_other_numbers_and_orders_of_pairs_change_nothing():

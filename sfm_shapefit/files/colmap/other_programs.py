@@ -39,7 +39,7 @@ def relative_poses_of(graph: pycolmap.PoseGraph) -> EpipolarGeometries:
     Raises:
         InputError: if it has none.
     """
-    ids, rotations, to_second = [], [], []
+    ids, rotations, to_second, num_matches = [], [], [], []
     for pair_id in sorted(graph.edges):
         edge = graph.edges[pair_id]
         pose = edge.cam2_from_cam1
@@ -48,6 +48,7 @@ def relative_poses_of(graph: pycolmap.PoseGraph) -> EpipolarGeometries:
             ids.append(pycolmap.pair_id_to_image_pair(pair_id))
             rotations.append(pose.rotation.matrix())
             to_second.append(-rotations[-1].T @ pose.translation / length)
+            num_matches.append(float(edge.num_matches))
     if not ids:
         raise InputError("the pose graph has no valid edge with a translation; load it from verified matches")
     known, pairs = np.unique(np.array(ids, dtype=np.int64), return_inverse=True)
@@ -56,4 +57,5 @@ def relative_poses_of(graph: pycolmap.PoseGraph) -> EpipolarGeometries:
         pairs=pairs.reshape(-1, 2).astype(np.int64),
         rotations=np.array(rotations),
         to_second=np.array(to_second),
+        num_matches=np.array(num_matches) if min(num_matches) > 0.0 else None,  # 0 where nobody counted
     )
