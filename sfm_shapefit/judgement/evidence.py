@@ -39,6 +39,17 @@ class Contradicted(NamedTuple):
     """Pairs of these that contradict where it stands."""
 
 
+class Oddity(NamedTuple):
+    """Images that hardly can be as the model has them: through such a lens, or at such a place."""
+
+    cameras: IntArray
+    """Their rows."""
+    what: str
+    """What is odd about them, a clause whose subject they are, in the plural."""
+    cannot_be: bool
+    """Whether that is impossible, and not only unusual."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PairFits:
     """How the directions of k pairs fit where cameras stand."""
@@ -174,6 +185,8 @@ class ModelEvidence:
     """By rows of the images; those that the pixels confirm are not among them."""
     untied: tuple[Untied, ...] = ()
     """By rows of the images; those that stand apart are not among them."""
+    oddities: tuple[Oddity, ...] = ()
+    """By rows of the images."""
     num_held: int | None = None
     """Cameras of the largest group that agreeing pairs, or points that fit, hold; None without pairs."""
     second: SecondOpinion | None = None

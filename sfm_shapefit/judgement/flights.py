@@ -1,0 +1,76 @@
+"""Cameras that fly: far from all others, or, in a video, far from where its frames before and after stand.
+
+A camera flies off if it is beyond 30 median distances from the median of all, and three times as far as the
+next nearer one: where a camera turns on the spot and then leaves, the distances grow without such a gap.
+
+A sequence of images (`scene.sequences`) is a path if a step from one to the next is a quarter of the distance
+of any two, or less, by the median; photographs in any order have no such steps, and frames of several cameras
+in turn have even ones. One to three images in a row leap if each is farther from the images before and after
+these than six steps as they are nearby, for each number between, than three times the distance of these two,
+and than 5 % of the extent. A jump from one clip to the next is one way only, so that nothing leaps there.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import distances_in_spreads
+from sfm_shapefit.base.wording import rounded
+from sfm_shapefit.judgement.evidence import Oddity
+from sfm_shapefit.judgement.limits import INSIDE, MANY, RARE, SIGMAS, SURE_SIGMAS
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.sequences import find_sequences
+
+_SHORT_STEP = 0.25  # share of the distance of any two images; steps of a path are shorter
+_SHORTEST_PATH = 8  # images; fewer have no usual step
+_NEARBY = 5  # steps on either side that say how long a step is there
+_MOST_IN_A_ROW = 3  # images that leap together; more are a piece of their own
+
+
+def find_flights(images: Images) -> Iterator[Oddity]:
+    """Yield the posed images that fly off, and those that leap from where their neighbors stand."""
+    posed = np.flatnonzero(images.is_posed)
+    centers, names = images.centers[posed], [images.names[k] for k in posed.tolist()]
+    spreads = distances_in_spreads(centers, centers)
+    flies = _flying(spreads)
+    if flies.any():
+        often = rounded(float(spreads[flies].min()), digits=2)
+        yield Oddity(posed[flies], f"fly off: they stand {often} times as far out as is usual, or more", False)
+    extent = float(np.linalg.norm(np.ptp(centers[~flies], axis=0)))
+    leaps = np.zeros(len(posed))
+    for rows, numbers in find_sequences(names):
+        kept = ~flies[rows]
+        leaps[rows[kept]] = _leaps(centers[rows[kept]], numbers[kept], RARE * extent)
+    if leaps.any():
+        far = leaps[leaps > 0.0].min() / extent
+        what = f"leap {far:.0%} of the extent, or more, from the images before and after them"
+        yield Oddity(posed[leaps > 0.0], what, False)
+
+
+def _flying(spreads: FloatArray) -> BoolArray:
+    """Return which cameras (n,), at some distances in spreads, fly off."""
+    order = np.sort(spreads)
+    gaps = np.flatnonzero((order[1:] > INSIDE) & (order[1:] > SIGMAS * order[:-1])) + 1
+    gaps = gaps[gaps >= (1.0 - MANY) * len(spreads)]  # what is left behind is the rest
+    return spreads >= order[gaps[0]] if len(gaps) else np.zeros(len(spreads), dtype=np.bool_)
+
+
+def _leaps(centers: FloatArray, numbers: IntArray, least: float) -> FloatArray:
+    """Return how far each image of a sequence (n, 3) leaps, `least` or more; 0 for all but those, (n,)."""
+    count = len(centers)
+    found, apart = np.zeros(count), np.linalg.norm(centers[:, None] - centers, axis=2)
+    steps = np.diagonal(apart, 1)
+    if count < _SHORTEST_PATH or np.median(steps) > _SHORT_STEP * np.median(apart):
+        return found
+    speeds = steps / np.diff(numbers)
+    for num in range(1, _MOST_IN_A_ROW + 1):
+        for before in range(count - num - 1):
+            ends, row = np.array([before, before + num + 1]), slice(before + 1, before + num + 1)
+            near = np.r_[speeds[max(0, before - _NEARBY) : before], speeds[ends[1] :][:_NEARBY]]
+            between = np.abs(numbers[ends][:, None] - numbers[row])
+            usual = SURE_SIGMAS * np.median(near) * between
+            far = apart[ends, row]
+            if (far > np.maximum(usual, max(SIGMAS * apart[tuple(ends)], least))).all() and not found[ends].any():
+                found[row] = far.min(axis=0)
+    return found
