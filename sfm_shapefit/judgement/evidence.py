@@ -15,6 +15,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, OUTNUMBERED, SIGMAS, SURE_SIGMAS
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
@@ -45,9 +46,15 @@ class Oddity(NamedTuple):
     cameras: IntArray
     """Their rows."""
     what: str
-    """What is odd about them, a clause whose subject they are, in the plural."""
+    """What each of them has: a lens, or a place, and what is odd about it."""
     cannot_be: bool
     """Whether that is impossible, and not only unusual."""
+
+    @property
+    def clause(self) -> str:
+        """How many have what."""
+        count = len(self.cameras)
+        return f"{counted(count, 'image')} {'has' if count == 1 else 'have'} {self.what}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

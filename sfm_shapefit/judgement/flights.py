@@ -36,7 +36,7 @@ def find_flights(images: Images) -> Iterator[Oddity]:
     flies = _flying(spreads)
     if flies.any():
         often = rounded(float(spreads[flies].min()), digits=2)
-        yield Oddity(posed[flies], f"fly off: they stand {often} times as far out as is usual, or more", False)
+        yield Oddity(posed[flies], f"a place {often} times as far out as is usual, or farther", False)
     extent = float(np.linalg.norm(np.ptp(centers[~flies], axis=0)))
     leaps = np.zeros(len(posed))
     for rows, numbers in find_sequences(names):
@@ -44,7 +44,7 @@ def find_flights(images: Images) -> Iterator[Oddity]:
         leaps[rows[kept]] = _leaps(centers[rows[kept]], numbers[kept], RARE * extent)
     if leaps.any():
         far = leaps[leaps > 0.0].min() / extent
-        what = f"leap {far:.0%} of the extent, or more, from the images before and after them"
+        what = f"a place {far:.0%} of the extent, or more, from the images before and after it"
         yield Oddity(posed[leaps > 0.0], what, False)
 
 
@@ -69,8 +69,8 @@ def _leaps(centers: FloatArray, numbers: IntArray, least: float) -> FloatArray:
             ends, row = np.array([before, before + num + 1]), slice(before + 1, before + num + 1)
             near = np.r_[speeds[max(0, before - _NEARBY) : before], speeds[ends[1] :][:_NEARBY]]
             between = np.abs(numbers[ends][:, None] - numbers[row])
-            usual = SURE_SIGMAS * np.median(near) * between
+            usual = SIGMAS * np.quantile(near, 0.8) * between
             far = apart[ends, row]
-            if (far > np.maximum(usual, max(SIGMAS * apart[tuple(ends)], least))).all() and not found[ends].any():
+            if (far > np.maximum(usual, max(2.0 * apart[tuple(ends)], least))).all() and not found[ends].any():
                 found[row] = far.min(axis=0)
     return found

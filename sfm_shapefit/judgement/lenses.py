@@ -140,7 +140,8 @@ def find_odd_lenses(images: Images, points: Points, pictures: Pictures, bogus: B
     faults.pop(("", False), None)
     for (what, cannot_be), lenses in faults.items():
         cameras = posed[np.isin(images.lens_of[posed], lenses)]
-        yield Oddity(cameras, f"have {_told(widths[lenses])}, with {what}", cannot_be)
+        kind = "a lens that cannot be" if cannot_be else "an unusual lens"
+        yield Oddity(cameras, f"{kind}: {_told(widths[lenses])}, with {what}", cannot_be)
     for rows, _ in find_sequences([images.names[k] for k in posed.tolist()]):
         cameras = posed[rows]
         lenses_of = images.lens_of[cameras]
@@ -148,15 +149,14 @@ def find_odd_lenses(images: Images, points: Points, pictures: Pictures, bogus: B
             logs = np.log([widths[lenses_of], images.focal_lengths_px[cameras]])
             logs -= np.median(logs, axis=1, keepdims=True)
             if SIGMA_PER_MEDIAN * np.median(np.abs(logs), axis=1).min() > FEW:
-                what = f"are of one device by their names, but have {_told(widths[lenses_of])}"
+                what = f"a lens unlike those of its sequence: {_told(widths[lenses_of])} by one device"
                 yield Oddity(cameras[np.abs(logs).min(axis=0) > FEW], what, False)
 
 
 def _told(widths: FloatArray) -> str:
     """Say how long focal lengths are, in picture widths."""
-    least, most = (f"{value:,.{0 if value >= 100.0 else 2}f}" for value in (widths.min(), widths.max()))
-    many, few = f"focal lengths of {least} to {most} picture widths", f"a focal length of {least} picture widths"
-    return few if least == most else many
+    least, most = (f"{value:,.{0 if value >= 10.0 else 2}f}" for value in (widths.min(), widths.max()))
+    return f"focal length {least} picture widths" if least == most else f"{least} to {most} picture widths"
 
 
 def _reaches(images: Images, points: Points, pictures: Pictures) -> FloatArray:
