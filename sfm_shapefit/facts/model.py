@@ -402,7 +402,7 @@ class CheckedFacts(FactsOfModel):
         lines = self.told_lines((judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
         notes = Row("warning", [one for one in self.warnings if one not in self.evidence.statements])
-        rows = [Row("weak", weak), second, notes]
+        rows = [Row("odd", [one.statement for one in self.evidence.odd]), Row("weak", weak), second, notes]
         return Telling(lines, rows, elsewhere="see the report", step=self.next_step)
 
 
