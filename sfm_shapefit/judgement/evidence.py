@@ -45,10 +45,19 @@ class Oddity(NamedTuple):
 
     cameras: IntArray
     """Their rows."""
-    what: str
-    """What each of them has: a lens, or a place, and what is odd about it."""
+    is_lens: bool
+    """Whether it is the lens of each; else its place."""
     cannot_be: bool
     """Whether that is impossible, and not only unusual."""
+    details: str
+    """The value that is odd, and why."""
+
+    @property
+    def what(self) -> str:
+        """What each of them has."""
+        if not self.is_lens:
+            return f"a place {self.details}"
+        return f"{'a lens that cannot be' if self.cannot_be else 'an unusual lens'}: {self.details}"
 
     @property
     def clause(self) -> str:

@@ -18,7 +18,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import distances_in_spreads
 from sfm_shapefit.base.wording import rounded
 from sfm_shapefit.judgement.evidence import Oddity
-from sfm_shapefit.judgement.limits import INSIDE, MANY, RARE, SIGMAS, SURE_SIGMAS
+from sfm_shapefit.judgement.limits import INSIDE, MANY, RARE, SIGMAS
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.sequences import find_sequences
 
@@ -36,7 +36,7 @@ def find_flights(images: Images) -> Iterator[Oddity]:
     flies = _flying(spreads)
     if flies.any():
         often = rounded(float(spreads[flies].min()), digits=2)
-        yield Oddity(posed[flies], f"a place {often} times as far out as is usual, or farther", False)
+        yield Oddity(posed[flies], False, False, f"{often} times as far out as is usual, or farther")
     extent = float(np.linalg.norm(np.ptp(centers[~flies], axis=0)))
     leaps = np.zeros(len(posed))
     for rows, numbers in find_sequences(names):
@@ -44,8 +44,8 @@ def find_flights(images: Images) -> Iterator[Oddity]:
         leaps[rows[kept]] = _leaps(centers[rows[kept]], numbers[kept], RARE * extent)
     if leaps.any():
         far = leaps[leaps > 0.0].min() / extent
-        what = f"a place {far:.0%} of the extent, or more, from the images before and after it"
-        yield Oddity(posed[leaps > 0.0], what, False)
+        details = f"{far:.0%} of the extent, or more, from the images before and after it"
+        yield Oddity(posed[leaps > 0.0], False, False, details)
 
 
 def _flying(spreads: FloatArray) -> BoolArray:
@@ -71,6 +71,8 @@ def _leaps(centers: FloatArray, numbers: IntArray, least: float) -> FloatArray:
             between = np.abs(numbers[ends][:, None] - numbers[row])
             usual = SIGMAS * np.quantile(near, 0.8) * between
             far = apart[ends, row]
-            if (far > np.maximum(usual, max(2.0 * apart[tuple(ends)], least))).all() and not found[ends].any():
+            if (far > np.maximum(usual, max(2.0 * apart[tuple(ends)], least))).all() and not found[
+                ends
+            ].any():
                 found[row] = far.min(axis=0)
     return found

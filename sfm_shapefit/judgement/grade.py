@@ -16,8 +16,8 @@ Do not use, if any of these holds:
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
 placed but are not in the output, that are kept though their matches make no points, that many pairs
 contradict and no pixels confirm (`witnesses`), or that evidence which the fit did not use names: another
-place, a seam, a wrong lens, a lens or place that hardly can be (`lenses`, `flights`). Trust is not low where the pixels confirm a camera. Look also, though no camera
-can be named, if
+place, a seam, a wrong lens, a lens or a place that hardly can be (`lenses`, `flights`). Trust is not low
+where the pixels confirm a camera. Look also, though no camera can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade
     many rejected pairs agree on a second configuration
@@ -163,9 +163,10 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
         suspicions.append(f"images contradict {counted(len(lenses), 'focal length')}")
     odd = [camera for one in evidence.oddities for camera in one.cameras.tolist()]
     impossible = [one for one in evidence.oddities if one.cannot_be]
-    are_many = sum(len(one.cameras) for one in impossible) > max(FEW * count, 1)
-    reasons += [one.clause for one in impossible if are_many]
-    suspicions += [one.clause for one in evidence.oddities if not (one.cannot_be and are_many)]
+    if (number := sum(len(one.cameras) for one in impossible)) > max(FEW * count, 1):
+        most = max(impossible, key=lambda one: len(one.cameras)).details
+        reasons.append(f"{number} of {counted(count, 'image')} have lenses that cannot be ({most})")
+    suspicions += [one.clause for one in evidence.oddities]
     cameras = tuple(images.names[camera] for camera in dict.fromkeys([*named, *odd, *doubted]))
     return Against(cameras, tuple(suspicions), tuple(reasons))
 

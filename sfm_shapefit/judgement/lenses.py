@@ -16,20 +16,20 @@ length alone, or large coefficients that cancel, are neither.
 Where points tell, the deviation is to be more than fits (4 px) at the distance within which 95 % of them lie:
 in small pictures, and where an object fills their middle, coefficients say nothing of the corners.
 
-Focal lengths of images that one device took (`scene.sequences`) differ by a tenth or more, by the median, only
-if they are not determined or if it zoomed. On nine sound models, each of whose images had a lens of its own,
+Focal lengths of images that one device took (`scene.sequences`) differ by a tenth, by the median, only if
+they are not determined or if it zoomed. On nine sound models, each of whose images had a lens of its own,
 they differ by 0.05 % to 4 %.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.evidence import Oddity
-from sfm_shapefit.judgement.limits import FEW, FITTING_PX, HALF, MANY, SMALLEST_SHAPE
+from sfm_shapefit.judgement.limits import FEW, FITTING_PX, HALF, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points
@@ -40,7 +40,9 @@ _WIDEST_DEG, _FINEST_PX = 150.0, 412_530.0  # degrees; focal length in pixels wh
 _REACHED = 0.95  # share of the observations of a lens within the distance up to which points tell
 _ASKED = 0.7  # share of the shorter side up to which fisheyes are asked; their pictures may end there
 _AT_CENTER = 0.02  # share of the way to the edge where the distortion is none yet
-_ALONG = np.array([_AT_CENTER, 0.2, 0.4, 0.6, 0.8, 1.0])  # shares of the way to the edge where a lens is asked
+_ALONG = np.array(
+    [_AT_CENTER, 0.2, 0.4, 0.6, 0.8, 1.0]
+)  # shares of the way to the edge where a lens is asked
 _AROUND = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]], dtype=np.float64)
 
 
@@ -55,31 +57,42 @@ class LensShape(NamedTuple):
     """Whether its distortion turns back within the circle that touches the nearer edges."""
     of_sine: float
     """Least rho / sin theta in the picture; see the module's header."""
-    of_tangent: float
-    """Largest rho / tan theta in the picture."""
+    of_tangent: tuple[float, float]
+    """Least and largest rho / tan theta in the picture."""
     off_px: tuple[float, float]
-    """Pixels by which rho is short of sin theta, and exceeds tan theta, where points end; infinite without any."""
+    """Pixels by which rho is short of sin theta, and exceeds tan theta, where points end; else infinite."""
 
     def fault(self, lens: Lens, is_bogus: bool) -> tuple[str, bool]:
         """Return what is wrong about the lens, and whether it cannot be; "" if nothing is."""
-        longer, (is_short, is_long) = self.of_tangent, (off > FITTING_PX for off in self.off_px)
+        (least, longer), (is_short, is_long) = self.of_tangent, (off > FITTING_PX for off in self.off_px)
         cx, cy = lens.row()[2:4].tolist()
-        if lens.focal_px > _FINEST_PX:
-            return "pixels finer than the air lets any camera see", True
-        if self.view_deg >= _WIDEST_DEG and longer > HALF:
-            return f"a straight picture {self.view_deg:.0f} degrees wide, which no lens makes", True
-        if self.folds:
-            return "a distortion that turns back inside the picture", True
-        if self.of_sine < _LEAST_OF_SINE and is_short:
-            return "a distortion that draws the edges in more than any fisheye does", True
-        if longer > _USUAL_OF_TANGENT and is_long:
-            often = "no lens does" if longer > _MOST_OF_TANGENT else "hardly any lens does"
-            return "a distortion that draws the corners out as " + often, longer > _MOST_OF_TANGENT
-        if not (0.0 <= cx <= lens.width and 0.0 <= cy <= lens.height):
-            return "a principal point outside the picture", False
-        if is_bogus and abs(longer - 1.0) > FEW and is_long:
-            return "parameters for which COLMAP's mapper drops images", False
-        return "", False
+        is_outside = not (0.0 <= cx <= lens.width and 0.0 <= cy <= lens.height)
+        faults = {
+            "pixels finer than the air lets any camera see": (lens.focal_px > _FINEST_PX, True),
+            f"a straight picture {self.view_deg:.0f} degrees wide, which no lens makes": (
+                self.view_deg >= _WIDEST_DEG and least > HALF,
+                True,
+            ),
+            "a distortion that turns back inside the picture": (self.folds, True),
+            "a distortion that draws the edges in more than any fisheye does": (
+                self.of_sine < _LEAST_OF_SINE and is_short,
+                True,
+            ),
+            "a distortion that draws the corners out as no lens does": (
+                longer > _MOST_OF_TANGENT and is_long,
+                True,
+            ),
+            "a distortion that draws the corners out as hardly any lens does": (
+                longer > _USUAL_OF_TANGENT and is_long,
+                False,
+            ),
+            "a principal point outside the picture": (is_outside, False),
+            "parameters for which COLMAP's mapper drops images": (
+                is_bogus and abs(longer - 1.0) > FEW and is_long,
+                False,
+            ),
+        }
+        return next(((what, cannot_be) for what, (is_so, cannot_be) in faults.items() if is_so), ("", False))
 
 
 def measure_lens(lens: Lens, reach_px: float = np.nan) -> LensShape:
@@ -92,25 +105,25 @@ def measure_lens(lens: Lens, reach_px: float = np.nan) -> LensShape:
     if lens.is_plane:
         ends = np.where(_AROUND > 0.0, [lens.width, lens.height] - principal, principal) * _AROUND
     ways = np.concatenate([(ends[:, None] * _ALONG[:, None]).reshape(-1, 2), reach_px * _AROUND[:4]])
-    rays = lens.rays(principal + ways)
+    rays = lens.rays(lens.row()[2:4] + ways)
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     rho, asked = np.hypot(*(ways / focal).T), ends.shape[0] * len(_ALONG)
     with np.errstate(invalid="ignore", divide="ignore"):
-        rho = rho * np.median(np.tan(theta[:asked:len(_ALONG)]) / rho[: asked : len(_ALONG)])
+        rho = rho * np.median(np.tan(theta[: asked : len(_ALONG)]) / rho[: asked : len(_ALONG)])
         straight = np.where(theta < 0.5 * np.pi, np.tan(theta), np.inf)
         bent = np.sin(np.minimum(theta, 0.5 * np.pi))
         along = np.diff(theta[:asked].reshape(len(ends), -1), axis=1)
         inside = np.hypot(*ways[:asked].T).reshape(len(ends), -1)[:, 1:] <= 0.5 * min(lens.width, lens.height)
         edges = theta[:asked].reshape(len(ends), -1)[:4, -1]
         wider = edges[:2] if lens.width >= lens.height else edges[2:]
-        short, long = bent - rho, rho - straight
+        short, long, stretch = bent - rho, rho - straight, rho[:asked] / straight[:asked]
     off = np.stack([short[asked:], long[asked:]]) * focal.mean()
     return LensShape(
         focal_widths=lens.focal_px / max(lens.width, lens.height),
         view_deg=float(np.degrees(wider.sum())) if lens.is_plane else np.nan,
         folds=bool((~(along > 0.0) & inside).any()),
         of_sine=float(np.nanmin(rho[:asked] / bent[:asked], initial=1.0)),
-        of_tangent=float(np.nanmax(rho[:asked] / straight[:asked], initial=0.0)),
+        of_tangent=(float(np.nanmin(stretch, initial=1.0)), float(np.nanmax(stretch, initial=0.0))),
         off_px=tuple(np.nan_to_num(off, nan=np.inf).max(axis=1).tolist()),
     )
 
@@ -138,32 +151,33 @@ def find_odd_lenses(images: Images, points: Points, pictures: Pictures, bogus: B
             widths[k] = shape.focal_widths
             faults.setdefault(shape.fault(lens, bool(bogus[k])), []).append(k)
     faults.pop(("", False), None)
-    for (what, cannot_be), lenses in faults.items():
+    for (fault, cannot_be), lenses in faults.items():
         cameras = posed[np.isin(images.lens_of[posed], lenses)]
-        kind = "a lens that cannot be" if cannot_be else "an unusual lens"
-        yield Oddity(cameras, f"{kind}: {_told(widths[lenses])}, with {what}", cannot_be)
+        yield Oddity(cameras, True, cannot_be, f"{_told(widths[lenses])}, with {fault}")
     for rows, _ in find_sequences([images.names[k] for k in posed.tolist()]):
         cameras = posed[rows]
-        lenses_of = images.lens_of[cameras]
-        if len(np.unique(lenses_of)) >= SMALLEST_SHAPE and np.isfinite(widths[lenses_of]).all():
-            logs = np.log([widths[lenses_of], images.focal_lengths_px[cameras]])
-            logs -= np.median(logs, axis=1, keepdims=True)
-            if SIGMA_PER_MEDIAN * np.median(np.abs(logs), axis=1).min() > FEW:
-                what = f"a lens unlike those of its sequence: {_told(widths[lenses_of])} by one device"
-                yield Oddity(cameras[np.abs(logs).min(axis=0) > FEW], what, False)
+        own = images.lens_of[cameras]
+        if len(np.unique(own)) >= SMALLEST_SHAPE and np.isfinite(widths[own]).all():
+            logs = np.log([widths[own], images.focal_lengths_px[cameras]])
+            logs = np.abs(logs - np.median(logs, axis=1, keepdims=True))
+            if SIGMA_PER_MEDIAN * np.median(logs, axis=1).min() > FEW:
+                details = f"{_told(widths[own])}, though one device took the images, as their names say"
+                yield Oddity(cameras[logs.min(axis=0) > FEW], True, False, details)
 
 
 def _told(widths: FloatArray) -> str:
     """Say how long focal lengths are, in picture widths."""
     least, most = (f"{value:,.{0 if value >= 10.0 else 2}f}" for value in (widths.min(), widths.max()))
-    return f"focal length {least} picture widths" if least == most else f"{least} to {most} picture widths"
+    return f"focal length {least if least == most else f'{least} to {most}'} picture widths"
 
 
 def _reaches(images: Images, points: Points, pictures: Pictures) -> FloatArray:
-    """Return how far from the principal point of each lens its points reach, (l,) in pixels; NaN without any."""
+    """Return how far from the principal point of each lens its points reach, (l,) in pixels, or NaN."""
     far: list[list[FloatArray]] = [[np.zeros(0)] for _ in images.lenses]
     for k, rows in enumerate(points.rows_of_images(images.num_images)):
         lens = int(images.lens_of[k])
         away = pictures.pixels(k, points.keypoints[rows]) - _middle(images.lenses[lens])
         far[lens].append(np.hypot(*away.T))
-    return np.array([np.quantile(each, _REACHED) if len(each) else np.nan for each in map(np.concatenate, far)])
+    return np.array(
+        [np.quantile(each, _REACHED) if len(each) else np.nan for each in map(np.concatenate, far)]
+    )
