@@ -175,9 +175,10 @@ def _reaches(images: Images, points: Points, pictures: Pictures) -> FloatArray:
     """Return how far from the principal point of each lens its points reach, (l,) in pixels, or NaN."""
     far: list[list[FloatArray]] = [[np.zeros(0)] for _ in images.lenses]
     for k, rows in enumerate(points.rows_of_images(images.num_images)):
-        lens = int(images.lens_of[k])
-        away = pictures.pixels(k, points.keypoints[rows]) - _middle(images.lenses[lens])
-        far[lens].append(np.hypot(*away.T))
+        lens = images.lenses[images.lens_of[k]]
+        if len(rows) and lens.is_adjustable:
+            away = pictures.pixels(k, points.keypoints[rows]) - _middle(lens)
+            far[images.lens_of[k]].append(np.hypot(*away.T))
     return np.array(
         [np.quantile(each, _REACHED) if len(each) else np.nan for each in map(np.concatenate, far)]
     )
