@@ -8,7 +8,7 @@ from sfm_shapefit.facts.model import EvidenceShares, ModelFacts, ModelInputs
 from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece, Solve
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.seed import PickedPoints
-from sfm_shapefit.judgement.grade import Grade, ModelVerdict
+from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.report.drawing import Poses, build_drawing
 
 UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7

@@ -31,7 +31,7 @@ from harness.driver import ROOT, Benchmark, Case, if_there
 from harness.record import Row, at_least, at_most, table
 from harness.scenes import temporary_scene
 from sfm_shapefit.files.colmap.quiet import quiet_log
-from sfm_shapefit.judgement.grade import Grade, ModelVerdict
+from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.synthetic import SceneOptions
 from sfm_shapefit.synthetic import scenes as synthetic_scenes
 from sfm_shapefit.synthetic.layouts import lay_out_scene

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 _MOST_TEXT = 300  # characters; a longer value of a table is counted instead
 _MOST_BYTES = 8_000_000
 """Bytes of the page of a notebook, at most; a notebook that holds a larger one opens slowly."""
-_COLORS = {"good": "#2e7d32", "look": "#b26a00", "do not use": "#c62828"}
+_COLORS = {"good": "#2e7d32", "look": "#b26a00", "cannot be judged": "#b26a00", "do not use": "#c62828"}
 _FRAME_HEIGHT_PX = 720  # pixels; as high as a notebook shows at once
 
 

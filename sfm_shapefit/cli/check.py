@@ -17,6 +17,7 @@ from sfm_shapefit.cli.console import (
     show_progress,
 )
 from sfm_shapefit.cli.flags import (
+    STRICT_HELP,
     Database,
     GroupedCommand,
     ImageFolder,
@@ -54,15 +55,13 @@ def check_command(
         ),
     ] = True,
     as_json: Json = False,
-    strict: Annotated[
-        bool, typer.Option("--strict", help='End with exit code 4 where the verdict is "do not use".')
-    ] = False,
+    strict: Annotated[bool, typer.Option("--strict", help=f"{STRICT_HELP}.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Judge the poses of MODEL as they stand, whatever program made it; MODEL is not changed.
 
-    A camera is weak if it sees few points, if its errors are large, if its points cover little of the
-    picture, or if many pairs contradict it. Pairs come from the database, else from the model's tracks.
+    A camera is weak if it sees few points, if its errors are large, or if many pairs
+    contradict it. Pairs come from the database, else from the model's tracks.
     A folder of several models, as sparse with 0 and 1, gets one table, and which of them to keep.
     """
     source = one_path(model, input_path, "MODEL")
@@ -101,7 +100,7 @@ def check_command(
             print_answer(told)
             written = "" if report is None else f"written to {report}; open {shlex.quote(str(report))}"
             print_ending(found.verdict.grade.value, found.verdict.statement, written, told.step.command)
-        if strict and found.verdict.is_bad:
+        if strict and not found.verdict.is_usable:
             raise typer.Exit(EXIT_UNSOLVABLE)
 
 

@@ -38,7 +38,12 @@ _NO_MEMORY = ("can't start new thread", "bad_alloc", "failed to map segment", "C
 _COMPILING = "compiling kernels, once; they are kept on disk"
 
 _WARNING_STYLE = "bold yellow"
-_GRADE_STYLES = {"good": "bold green", "look": "bold yellow", "do not use": "bold red"}
+_GRADE_STYLES = {
+    "good": "bold green",
+    "look": "bold yellow",
+    "cannot be judged": "bold yellow",
+    "do not use": "bold red",
+}
 
 _SAID_EVERY_S = 2.0  # seconds between lines of progress where there is no terminal; logs stay short
 _AGAIN_S = 0.02  # seconds after which a lost interrupt comes again; native code has returned by then

@@ -109,6 +109,7 @@ _FIRST_SCREEN = {
     ),
 }
 """Options that `--help` lists, in their order, of the commands that have many; `--help-all` lists all."""
+STRICT_HELP = 'End with exit code 4 where the verdict is "do not use" or "cannot be judged"'
 _HELP_ALL = "--help-all"
 _ALL_OPTIONS = "sfm_shapefit.all_options"
 """Key of a context's `meta` that is set where the help is to list all options."""
@@ -125,7 +126,7 @@ class OutputFlags(Settings):
         "", "Folder of the images, small pictures of which are in report.html; 4 MB at most."
     )
     json: bool = option(False, "Print one JSON object on stdout and nothing else.")
-    strict: bool = option(False, 'End with exit code 4 where the verdict is "do not use"; OUT is written.')
+    strict: bool = option(False, f"{STRICT_HELP}; OUT is written.")
     quiet: bool = option(False, "Print nothing but errors.")
     verbose: bool = option(False, "Show every detail, the seconds of each stage, and pycolmap's messages.")
 

@@ -61,7 +61,7 @@ class Run(Generic[S]):
         flags = self.flags
         how: dict[str, Any] = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
         write_result(found, out, protect=self.protect, **how)
-        self.is_unusable = flags.strict and found.verdict.is_bad
+        self.is_unusable = flags.strict and not found.verdict.is_usable
         if self.flags.json:
             self.shown = lambda: print_json(found.summary())
         elif not self.flags.quiet:

@@ -26,7 +26,8 @@ from sfm_shapefit.facts.model import (
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
-from sfm_shapefit.judgement.grade import FEW_PLACED, Grade, ModelVerdict, in_another_model
+from sfm_shapefit.judgement.grade import FEW_PLACED, in_another_model
+from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.rotations.averaged import AveragedRotations
 
 if TYPE_CHECKING:
@@ -146,7 +147,7 @@ class MapResult(Written):
         here = max(sizes) / self.num_placed
         if verdict.grade is not Grade.GOOD or here >= FEW_PLACED:
             return verdict
-        return replace(verdict, grade=Grade.LOOK, reasons=(*verdict.reasons, in_another_model(here)))
+        return ModelVerdict.weigh([*verdict.findings, in_another_model(here)])
 
     @property
     def facts(self) -> MapFacts:

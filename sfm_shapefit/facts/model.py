@@ -35,7 +35,7 @@ from sfm_shapefit.facts.placed import (
 from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
 from sfm_shapefit.facts.scene import DistanceFacts, Loop, describe_line, describe_loops
 from sfm_shapefit.facts.tables import CameraRow, PairRow
-from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.placement.place import Placement
@@ -402,7 +402,7 @@ class CheckedFacts(FactsOfModel):
         lines = self.told_lines((judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
         notes = Row("warning", [one for one in self.warnings if one not in self.evidence.statements])
-        rows = [Row("odd", [one.statement for one in self.evidence.odd]), Row("weak", weak), second, notes]
+        rows = [Row("weak", weak), second, notes]
         return Telling(lines, rows, elsewhere="see the report", step=self.next_step)
 
 

@@ -21,8 +21,8 @@ from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded
 from sfm_shapefit.facts.tables import CameraRow
-from sfm_shapefit.judgement.grade import ModelVerdict
 from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.placement.place import Placement, count_large
 from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.solver.options import Status

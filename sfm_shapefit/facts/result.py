@@ -48,14 +48,15 @@ from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import (
-    ModelVerdict,
     Shares,
     judge_graph,
     judge_model,
+    too_few_to_judge,
     weigh_evidence,
 )
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import FEW
+from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_each
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.support import ObservationShares
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -213,11 +214,11 @@ class LocateResult(_Placed):
     """The sensors that were refined in their rigs."""
     control_points: tuple[ControlPoint, ...] = ()
     """Ground control points with their residuals, where some are given."""
-    suspicions: tuple[str, ...] = ()
+    suspicions: tuple[Reason, ...] = ()
     """What speaks against the model beside its own evidence: steps that failed, and what those who gave the
     rotations saw."""
-    recognized: str = ""
-    """What the input seems to be instead of what it was read as, if it is that."""
+    recognized: Reason | None = None
+    """What the input seems to be instead of what it was read as; None if it is not."""
     join: JoinFacts | None = None
     """What came of joining it to a larger model of `map`."""
     elsewhere: BoolArray | None = None
@@ -302,19 +303,28 @@ class LocateResult(_Placed):
             placed=float(np.mean(is_posed if elsewhere is None else is_posed[~elsewhere])),
             here=float(np.mean(is_posed)),
         )
-        outside = [*self.placement.cameras[~self.kept].tolist(), *self.cameras_without_support]
+        left_out, lone = (
+            [self.images.names[camera] for camera in cameras]
+            for cameras in (self.placement.cameras[~self.kept].tolist(), self.cameras_without_support)
+        )
+        before = (
+            *too_few_to_judge(int(is_posed.sum())),
+            *of_each(Kind.LEFT_OUT, left_out, "it is left out: not trusted, or it sees too few points"),
+            *of_each(Kind.POINTS, lone, NO_SUPPORT),
+            *weigh_evidence(self.evidence, self.placed),
+        )
         repeats = tuple(match_warnings(self.directions))[:1]
-        names = [self.images.names[camera] for camera in outside]
-        against = weigh_evidence(self.evidence, self.placed)
-        suspicions = (*repeats, *self._off_priors(), *self.suspicions)
-        return judge_model(self.placement, shares, names, suspicions, against).led_by(self.recognized)
+        repeated = (Reason(kind=Kind.REPEATED, sentence=sentence) for sentence in repeats)
+        after = (*repeated, *self._off_priors(), *self.suspicions)
+        return judge_model(self.placement, shares, before, after).led_by(self.recognized)
 
-    def _off_priors(self) -> Iterator[str]:
+    def _off_priors(self) -> Iterator[Reason]:
         """Yield that many position priors contradict the cameras: a few are wrong, many may be right."""
         if self.prior_fit is not None:
             wrong, count = len(self.prior_fit.wrong), int(np.isfinite(self.prior_fit.off).sum())
             if wrong > max(1, FEW * count):
-                yield f"{wrong} of {counted(count, 'position prior')} contradict where cameras stand"
+                clause = f"{wrong} of {counted(count, 'position prior')} contradict where cameras stand"
+                yield Reason(kind=Kind.INPUT, sentence=clause)
 
     @property
     def database(self) -> Path | None:

@@ -6,10 +6,11 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.wording import counted_are, first_of
-from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, MOST_LEVEL_DEG, largest_sigmas, uncertain_cameras
+from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import RARE
 from sfm_shapefit.judgement.options import TrustOptions
+from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Kind, Reason
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.solver.options import Status
@@ -46,11 +47,12 @@ def rotation_warnings(turned_deg: FloatArray, names: Sequence[str], sigma_deg: f
         yield f"{counted_are(len(wrong), 'given rotation')} wrong and corrected: {first_of(wrong)}; {most}"
 
 
-def rotation_suspicions(turned_deg: FloatArray, sigma_deg: float) -> Iterator[str]:
+def rotation_suspicions(turned_deg: FloatArray, sigma_deg: float) -> Iterator[Reason]:
     """Yield that all given rotations, said to be off by `sigma_deg`, are farther off, as of another scene."""
     typical = float(np.nanmedian(turned_deg)) / _MEDIAN_TURN if np.isfinite(turned_deg).any() else 0.0
     if typical > _GROSS * sigma_deg:
-        yield f"the rotations are {typical:.0f} degrees off, not {sigma_deg:g}: {IS_ITS_DATABASE}"
+        clause = f"the rotations are {typical:.0f} degrees off, not {sigma_deg:g}: {IS_ITS_DATABASE}"
+        yield Reason(kind=Kind.INPUT, sentence=clause)
 
 
 def quality_warnings(placement: Judged) -> Iterator[str]:

@@ -8,6 +8,7 @@ it has none at all. Half of the pairs between fisheyes in a park know theirs wor
 though the model is sound.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -15,10 +16,10 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
-from sfm_shapefit.base.wording import counted
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, OUTNUMBERED, SIGMAS, SURE_SIGMAS
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
+from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
@@ -43,27 +44,31 @@ class Contradicted(NamedTuple):
 class Oddity(NamedTuple):
     """Images that hardly can be as the model has them: through such a lens, or at such a place."""
 
-    cameras: IntArray
-    """Their rows."""
-    is_lens: bool
-    """Whether it is the lens of each; else its place."""
+    kind: Kind
+    """Whether it is the lens of each, or its place."""
     cannot_be: bool
     """Whether that is impossible, and not only unusual."""
-    details: str
-    """The value that is odd, and why."""
+    cameras: IntArray
+    """(k,) their rows."""
+    values: FloatArray
+    """(k,) what is odd about each."""
+    sentence: str
+    """What that is, with {} for the value."""
 
     @property
     def what(self) -> str:
-        """What each of them has."""
-        if not self.is_lens:
-            return f"a place {self.details}"
-        return f"{'a lens that cannot be' if self.cannot_be else 'an unusual lens'}: {self.details}"
+        """What they have, a lens or a place, with the least and the largest value."""
+        return self._say(self.values)
 
     @property
-    def clause(self) -> str:
-        """How many have what."""
-        count = len(self.cameras)
-        return f"{counted(count, 'image')} {'has' if count == 1 else 'have'} {self.what}"
+    def of_each(self) -> Iterator[tuple[int, str]]:
+        """The row of each, and what it has."""
+        for row, camera in enumerate(self.cameras.tolist()):
+            yield camera, self._say(self.values[row : row + 1])
+
+    def _say(self, values: FloatArray) -> str:
+        told = [f"{value:,.{0 if value >= 10.0 else 2}f}" for value in (values.min(), values.max())]
+        return self.sentence.format(" to ".join(dict.fromkeys(told)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

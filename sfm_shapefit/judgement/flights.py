@@ -16,9 +16,9 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import distances_in_spreads
-from sfm_shapefit.base.wording import rounded
 from sfm_shapefit.judgement.evidence import Oddity
 from sfm_shapefit.judgement.limits import INSIDE, MANY, RARE, SIGMAS
+from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.sequences import find_sequences
 
@@ -35,17 +35,16 @@ def find_flights(images: Images) -> Iterator[Oddity]:
     spreads = distances_in_spreads(centers, centers)
     flies = _flying(spreads)
     if flies.any():
-        often = rounded(float(spreads[flies].min()), digits=2)
-        yield Oddity(posed[flies], False, False, f"{often} times as far out as is usual, or farther")
+        sentence = "a place {} times as far out as is usual"
+        yield Oddity(Kind.PLACE, False, posed[flies], spreads[flies], sentence)
     extent = float(np.linalg.norm(np.ptp(centers[~flies], axis=0)))
     leaps = np.zeros(len(posed))
     for rows, numbers in find_sequences(names):
         kept = ~flies[rows]
         leaps[rows[kept]] = _leaps(centers[rows[kept]], numbers[kept], RARE * extent)
-    if leaps.any():
-        far = leaps[leaps > 0.0].min() / extent
-        details = f"{far:.0%} of the extent, or more, from the images before and after it"
-        yield Oddity(posed[leaps > 0.0], False, False, details)
+    if (far := leaps > 0.0).any():
+        sentence = "a place {} % of the extent away from the images before and after it"
+        yield Oddity(Kind.PLACE, False, posed[far], 100.0 * leaps[far] / extent, sentence)
 
 
 def _flying(spreads: FloatArray) -> BoolArray:

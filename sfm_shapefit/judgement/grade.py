@@ -1,4 +1,4 @@
-"""One verdict for a whole model: good, look at some cameras, or do not use.
+"""One verdict for a whole model: good, look at some cameras, cannot be judged, or do not use.
 
 Do not use, if any of these holds:
 
@@ -27,79 +27,45 @@ where the pixels confirm a camera. Look also, though no camera can be named, if
     two position priors and more than a tenth contradict where cameras stand (`placement.prior_fit`)
     the images can be arranged in two ways (`rotations.arrangements`), whichever was taken
 
+It cannot be judged, unless it is not to be used, if nothing checks it: it has two cameras only, or no pair
+says how two of them stand to each other, as where poses come without points and database; or, in a bare
+graph, no pair is checked by others.
+
 Otherwise the model is good. How many of the observations see a 3D point is told, and decides nothing: on
 thirteen real scenes with good rotations 53 to 99.8 % do (least of all those of facing cameras in a park, who
 stand right to 0.5 % of the extent), and 45 to 100 % of the pairs agree. Wrong pairs alone, even half of all,
 do not make a model bad.
 """
 
-import enum
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Annotated, NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import distances_in_spreads
-from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import Judged
-from sfm_shapefit.judgement.limits import FEW, HALF, INSIDE, KNOWN_DEG, MANY, RARE, SURE_SIGMAS
+from sfm_shapefit.judgement.limits import (
+    FEW,
+    HALF,
+    INSIDE,
+    KNOWN_DEG,
+    MANY,
+    RARE,
+    SMALLEST_SHAPE,
+    SURE_SIGMAS,
+)
+from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
+from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
 
 MOST_LEVEL_DEG = SURE_SIGMAS * KNOWN_DEG  # degrees, level of agreeing residuals; see the header
-IS_ITS_DATABASE = "is this the model's database?"  # ends a reason that doubts the matches, not the model
 FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to be looked at
-
-
-class Grade(enum.StrEnum):
-    """What to do with a model."""
-
-    GOOD = "good"
-    LOOK = "look"
-    DO_NOT_USE = "do not use"
-
-
-class ModelVerdict(Record):
-    """Whether the model can be used; the rules are in `judgement.grade`."""
-
-    grade: Annotated[Grade, "What to do with it."]
-    statement: Annotated[str, "The same in a sentence."] = ""
-    cameras: Annotated[tuple[str, ...], "To be looked at, the least trusted first."]
-    reasons: Annotated[tuple[str, ...], "Why the grade is not better; none if it is good."]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "statement", self._sentence())
-
-    @property
-    def is_bad(self) -> bool:
-        """Whether the model should not be used."""
-        return self.grade is Grade.DO_NOT_USE
-
-    @property
-    def doubts_database(self) -> bool:
-        """Whether the matches are those of other images, as it seems."""
-        return any(reason.endswith(IS_ITS_DATABASE) for reason in self.reasons)
-
-    def led_by(self, reason: str) -> "ModelVerdict":
-        """Return the verdict with a first reason, which explains others, if it is not empty."""
-        if not reason:
-            return self
-        grade = Grade.LOOK if self.grade is Grade.GOOD else self.grade
-        return replace(self, grade=grade, reasons=(reason, *self.reasons))
-
-    def _sentence(self) -> str:
-        if self.grade is Grade.GOOD:
-            return "good"
-        if self.grade is Grade.LOOK and self.cameras:
-            what = f"look at {counted(len(self.cameras), 'camera')} ({first_of(self.cameras)})"
-            return "; ".join([what, *self.reasons])
-        return f"{self.grade.value}: {'; '.join(self.reasons)}"
 
 
 class Shares(NamedTuple):
@@ -111,123 +77,172 @@ class Shares(NamedTuple):
     """The same of all images; of several models, the others' are missing here, though they are placed."""
 
 
-class Against(NamedTuple):
-    """What evidence that the fit did not use says against a model."""
-
-    cameras: tuple[str, ...]
-    """Names of cameras to be looked at."""
-    suspicions: tuple[str, ...]
-    """A clause each, if it is to be looked at."""
-    reasons: tuple[str, ...]
-    """A clause each, if it is not to be used."""
-
-
-NOTHING_AGAINST = Against((), (), ())
-
-
-def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
-    """Return what evidence says against a model of some images; the others are not posed."""
-    loose = [group.cameras for group in evidence.untied if group.is_loose]
-    unchecked = [camera for group in evidence.untied for camera in group.cameras.tolist()]
-    groups, second = [*(seam.cameras for seam in evidence.seams), *loose], evidence.second
-    if second is not None and len(second.wrong) > 1:  # which tells where the seam of these runs
-        groups = [g if second.has_most_alike(g) else np.setdiff1d(g, second.alike) for g in groups]
-        groups.insert(0, second.wrong)
-    apart = list(dict.fromkeys(camera for group in groups for camera in group.tolist()))
+def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
+    """Yield what evidence says against a model of some images; the others are not posed."""
+    second, count = evidence.second, int(images.is_posed.sum())
+    confirmed = set() if second is None else set(second.confirmed.tolist())
     wrong, undecided = ([], []) if second is None else (second.wrong.tolist(), second.undecided.tolist())
+    apart, clause = _find_apart(evidence)
+    places = [place.camera for place in evidence.places]
     alone = np.bincount(images.lens_of[images.is_posed], minlength=len(images.lenses)) == 1
     lenses = [wrong.lens for wrong in evidence.lenses]
     through = np.flatnonzero(images.is_posed & np.isin(images.lens_of, lenses) & alone[images.lens_of])
-    places = [place.camera for place in evidence.places]
-    named = dict.fromkeys([*apart, *wrong, *undecided, *places, *through.tolist()])
-    confirmed = set() if second is None else set(second.confirmed.tolist())
-    doubted = [one.camera for one in evidence.contradicted]
-    doubted += [*unchecked, *([] if second is None else second.ambiguous.tolist())]
-    count = int(images.is_posed.sum())
-    suspicions: list[str] = []
-    reasons: list[str] = []
+    named = {*apart, *wrong, *undecided, *places, *through.tolist()}
+
+    def names(cameras: Iterable[int]) -> tuple[str, ...]:
+        return tuple(images.names[camera] for camera in cameras)
+
     if apart:
-        some = f"{len(apart)} of {counted(count, 'camera')} stand"
-        are_loose = len(loose) == len(groups)
-        clause = f"nothing says how {some} to the rest" if are_loose else f"{some} apart from the rest"
-        (reasons if len(set(apart) - confirmed) > FEW * count else suspicions).append(clause)
-    if len(loose) < len(evidence.untied):
-        suspicions.append("nothing checks how groups of cameras stand to one another")
+        clause = clause.format(f"{len(apart)} of {counted(count, 'camera')}")
+        grade = Grade.DO_NOT_USE if len(set(apart) - confirmed) > FEW * count else Grade.LOOK
+        yield Reason(kind=Kind.APART, sentence=clause, images=names(apart), grade=grade)
     if evidence.num_held is not None and evidence.num_held < HALF * count:
-        reasons.append(f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}")
-    if len(named.keys() - confirmed) > MANY * count and len(named) > len(apart):
-        reasons.append(f"evidence speaks against {len(named)} of {counted(count, 'camera')}")
-    if second is not None and second.has_nothing_in_common:
-        suspicions.append("the model that map makes of the same database has another shape")
+        clause = f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}"
+        yield Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE)
+    if len(named - confirmed) > MANY * count and len(named) > len(apart):
+        clause = f"evidence speaks against {len(named)} of {counted(count, 'camera')}"
+        yield Reason(kind=Kind.PLACE, sentence=clause, grade=Grade.DO_NOT_USE)
+    elsewhere = "it stands elsewhere in the model that map made of the same database"
+    wrong = [camera for camera in wrong if camera not in apart]
+    yield from of_each(Kind.SECOND_OPINION, names(wrong), f"{elsewhere}, which pairs support")
+    yield from of_each(Kind.SECOND_OPINION, names(undecided), f"{elsewhere}, and pairs support neither")
+    yield from of_each(Kind.PLACE, names(places), "pairs agree on another place of it")
     if lenses:
-        suspicions.append(f"images contradict {counted(len(lenses), 'focal length')}")
-    odd = [camera for one in evidence.oddities for camera in one.cameras.tolist()]
-    impossible = [one for one in evidence.oddities if one.cannot_be]
-    if (number := sum(len(one.cameras) for one in impossible)) > max(FEW * count, 1):
-        most = max(impossible, key=lambda one: len(one.cameras)).details
-        reasons.append(f"{number} of {counted(count, 'image')} have lenses that cannot be ({most})")
-    suspicions += [one.clause for one in evidence.oddities]
-    cameras = tuple(images.names[camera] for camera in dict.fromkeys([*named, *odd, *doubted]))
-    return Against(cameras, tuple(suspicions), tuple(reasons))
+        clause = f"images contradict {counted(len(lenses), 'focal length')}"
+        yield Reason(kind=Kind.LENS, sentence=clause, images=names(through.tolist()))
+    yield from _weigh_oddities(evidence, images)
+    for one in evidence.contradicted:
+        clause = f"{one.num_against} of its {one.num_pairs} pairs contradict where it stands"
+        yield from of_each(Kind.PAIRS, names([one.camera]), clause)
+    unchecked = [k for group in evidence.untied for k in group.cameras.tolist() if k not in apart]
+    if unchecked:
+        clause = "nothing checks how groups of cameras stand to one another"
+        yield Reason(kind=Kind.UNCHECKED, sentence=clause, images=names(unchecked))
+    if second is not None:
+        clause = "at least half as much speaks for another place or rotation of it"
+        yield from of_each(Kind.SECOND_OPINION, names(second.ambiguous.tolist()), clause)
+        if second.has_nothing_in_common:
+            clause = "the model that map makes of the same database has another shape"
+            yield Reason(kind=Kind.APART, sentence=clause)
+
+
+def _weigh_oddities(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
+    """Yield which lenses and places hardly can be: of few images of each, of more as one."""
+    few = max(FEW * int(images.is_posed.sum()), 1)
+    are_many = sum(len(one.cameras) for one in evidence.oddities if one.cannot_be) > few
+    for one in sorted(evidence.oddities, key=lambda one: -len(one.cameras)):
+        number = len(one.cameras)
+        is_bad = one.cannot_be and are_many
+        if is_bad or number > few:
+            clause = f"{counted(number, 'image')} {'has' if number == 1 else 'have'} {one.what}"
+            names = tuple(images.names[camera] for camera in one.cameras.tolist())
+            grade = Grade.DO_NOT_USE if is_bad else Grade.LOOK
+            yield Reason(kind=one.kind, sentence=clause, images=names, grade=grade)
+        else:
+            for camera, what in one.of_each:
+                yield from of_each(one.kind, [images.names[camera]], f"it has {what}")
+
+
+def _find_apart(evidence: ModelEvidence) -> tuple[list[int], str]:
+    """Return the cameras that stand apart, and a clause on how many ({}) do."""
+    loose, second = [group.cameras for group in evidence.untied if group.is_loose], evidence.second
+    groups = [*(seam.cameras for seam in evidence.seams), *loose]
+    if second is not None and len(second.wrong) > 1:  # which tells where the seam of these runs
+        groups = [g if second.has_most_alike(g) else np.setdiff1d(g, second.alike) for g in groups]
+        groups.insert(0, second.wrong)
+    clause = (
+        "nothing says how {} stand to the rest"
+        if len(loose) == len(groups)
+        else "{} stand apart from the rest"
+    )
+    return list(dict.fromkeys(camera for group in groups for camera in group.tolist())), clause
+
+
+def too_few_to_judge(num_cameras: int) -> Iterator[Reason]:
+    """Yield that nothing checks a model, if it has so few cameras."""
+    if num_cameras < SMALLEST_SHAPE:
+        clause = "it has two cameras only, so that nothing checks their poses and lenses"
+        yield Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED)
 
 
 def judge_graph(placement: Judged) -> ModelVerdict:
     """Return the verdict on a placed graph, which has no observations."""
-    level, against = placement.assessment.level_deg, NOTHING_AGAINST
+    level, assessment, reasons = placement.assessment.level_deg, placement.assessment, list[Reason]()
     if level > MOST_LEVEL_DEG:
-        against = Against((), (), (f"the directions are {level:.0f} degrees off the cameras",))
-    return judge_model(placement, Shares(), against=against)
+        clause = f"the directions are {level:.0f} degrees off the cameras"
+        reasons.append(Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE))
+    if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
+        clause = "no pair is checked by others"
+        reasons.append(Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED))
+    return judge_model(placement, Shares(), reasons)
 
 
 def judge_model(
-    placement: Judged,
-    shares: Shares,
-    outside: Sequence[str] = (),
-    suspicions: Sequence[str] = (),
-    against: Against = NOTHING_AGAINST,
+    placement: Judged, shares: Shares, before: Iterable[Reason] = (), after: Iterable[Reason] = ()
 ) -> ModelVerdict:
     """Apply the rules of the module's header.
 
     Args:
         placement: the evidence for pairs and cameras.
         shares: how much agrees.
-        outside: names of cameras that are not in the output, or that no point supports.
-        suspicions: what else speaks against the model, a clause each.
-        against: what evidence that the fit did not use says.
+        before: what else speaks against the model, whose cameras are named first.
+        after: the same, named last.
     """
-    bad = (*_reasons_against(shares), *against.reasons)
-    trust, cameras = placement.assessment.trust, placement.cameras
-    doubtful = trust < LOW_TRUST
-    doubtful[uncertain_cameras(placement)] = True
+    return ModelVerdict.weigh(
+        [
+            *_reasons_against(shares),
+            *before,
+            *_doubtful_cameras(placement),
+            *after,
+            *_reasons_to_look(placement, shares),
+        ]
+    )
+
+
+def _doubtful_cameras(placement: Judged) -> Iterator[Reason]:
+    """Yield what speaks against each camera by its trust, its uncertainty and how loose it hangs."""
+    trust, reasons = placement.assessment.trust, placement.assessment.reasons
+    found = {
+        k: (Kind.TRUST, reasons[k] or "pairs speak against it")
+        for k in np.flatnonzero(trust < LOW_TRUST).tolist()
+    }
+    uncertain = Kind.UNCERTAIN, f"it is uncertain by more than {RARE:.0%} of the extent"
+    found = dict.fromkeys(uncertain_cameras(placement).tolist(), uncertain) | found
     adjusted = placement.adjusted_covariances
     for group in placement.assessment.loose_groups:  # by the pairs; where the pixels were asked, they say
-        doubtful[group.cameras] |= adjusted is None or bool(np.isnan(adjusted[group.cameras]).any())
-    rows = np.flatnonzero(doubtful)
-    names = [placement.graph.name_of(int(cameras[k])) for k in rows[np.argsort(trust[rows], kind="stable")]]
-    named = tuple(dict.fromkeys([*outside, *against.cameras, *names]))
-    unnamed = [*suspicions, *against.suspicions]
+        if adjusted is None or np.isnan(adjusted[group.cameras]).any():
+            loose = dict.fromkeys(group.cameras.tolist(), (Kind.UNCERTAIN, str(group.cause.value)))
+            found = loose | found
+    for k in sorted(found, key=lambda k: (trust[k], k)):
+        kind, clause = found[k]
+        yield from of_each(kind, [placement.graph.name_of(int(placement.cameras[k]))], clause)
+
+
+def _reasons_to_look(placement: Judged, shares: Shares) -> Iterator[Reason]:
+    """Yield why a model is to be looked at as a whole."""
     if placement.second_configuration is not None:
-        unnamed.append("many rejected pairs agree on a second configuration")
+        clause = "many rejected pairs agree on a second configuration"
+        yield Reason(kind=Kind.REPEATED, sentence=clause)
     if shares.placed < FEW_PLACED:
-        unnamed.append(f"only {shares.placed:.0%} of the images are placed")
+        yield Reason(kind=Kind.LEFT_OUT, sentence=f"only {shares.placed:.0%} of the images are placed")
     elif shares.here < FEW_PLACED:
-        unnamed.append(in_another_model(shares.here))
-    reasons = bad or tuple(unnamed)
-    grade = Grade.DO_NOT_USE if bad else Grade.LOOK if named or unnamed else Grade.GOOD
-    return ModelVerdict(grade=grade, cameras=named, reasons=reasons)
+        yield in_another_model(shares.here)
 
 
-def in_another_model(here: float) -> str:
+def in_another_model(here: float) -> Reason:
     """Say that a model has only a share of the images that stand in some model."""
-    return f"{1.0 - here:.0%} of the images stand in another model"
+    clause = f"{1.0 - here:.0%} of the images stand in another model"
+    return Reason(kind=Kind.LEFT_OUT, sentence=clause)
 
 
-def _reasons_against(shares: Shares) -> Iterator[str]:
+def _reasons_against(shares: Shares) -> Iterator[Reason]:
     """Yield why a model should not be used; a share that is not known is no reason."""
     if shares.contradicting >= HALF:
-        yield f"{shares.contradicting:.0%} of the observations contradict the cameras"
+        clause = f"{shares.contradicting:.0%} of the observations contradict the cameras"
+        yield Reason(kind=Kind.PAIRS, sentence=clause, grade=Grade.DO_NOT_USE)
     if shares.placed < HALF:
-        yield f"only {shares.placed:.0%} of the images are placed"
+        clause = f"only {shares.placed:.0%} of the images are placed"
+        yield Reason(kind=Kind.LEFT_OUT, sentence=clause, grade=Grade.DO_NOT_USE)
 
 
 def uncertain_cameras(placement: Judged) -> IntArray:

@@ -30,6 +30,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.evidence import Oddity
 from sfm_shapefit.judgement.limits import FEW, FITTING_PX, HALF, SMALLEST_SHAPE
+from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points
@@ -153,22 +154,20 @@ def find_odd_lenses(images: Images, points: Points, pictures: Pictures, bogus: B
     faults.pop(("", False), None)
     for (fault, cannot_be), lenses in faults.items():
         cameras = posed[np.isin(images.lens_of[posed], lenses)]
-        yield Oddity(cameras, True, cannot_be, f"{_told(widths[lenses])}, with {fault}")
+        kind = "a lens that cannot be" if cannot_be else "an unusual lens"
+        sentence = f"{kind}: focal length {{}} picture widths, with {fault}"
+        yield Oddity(Kind.LENS, cannot_be, cameras, widths[images.lens_of[cameras]], sentence)
     for rows, _ in find_sequences([images.names[k] for k in posed.tolist()]):
         cameras = posed[rows]
-        own = images.lens_of[cameras]
-        if len(np.unique(own)) >= SMALLEST_SHAPE and np.isfinite(widths[own]).all():
-            logs = np.log([widths[own], images.focal_lengths_px[cameras]])
+        own = widths[images.lens_of[cameras]]
+        if len(np.unique(images.lens_of[cameras])) >= SMALLEST_SHAPE and np.isfinite(own).all():
+            logs = np.log([own, images.focal_lengths_px[cameras]])
             logs = np.abs(logs - np.median(logs, axis=1, keepdims=True))
             if SIGMA_PER_MEDIAN * np.median(logs, axis=1).min() > FEW:
-                details = f"{_told(widths[own])}, though one device took the images, as their names say"
-                yield Oddity(cameras[logs.min(axis=0) > FEW], True, False, details)
-
-
-def _told(widths: FloatArray) -> str:
-    """Say how long focal lengths are, in picture widths."""
-    least, most = (f"{value:,.{0 if value >= 10.0 else 2}f}" for value in (widths.min(), widths.max()))
-    return f"focal length {least if least == most else f'{least} to {most}'} picture widths"
+                far, usual = logs.min(axis=0) > FEW, np.median(own)
+                sentence = "a lens unlike others of one device, as names say: focal length {} picture widths"
+                sentence = f"{sentence}, where {usual:.3g} is usual"
+                yield Oddity(Kind.LENS, False, cameras[far], own[far], sentence)
 
 
 def _reaches(images: Images, points: Points, pictures: Pictures) -> FloatArray:

@@ -15,8 +15,8 @@ from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.files.colmap.database import find_database
 from sfm_shapefit.files.model_folder import model_folders
-from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.judgement.limits import FEW, HALF
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.clock import Progress
 from sfm_shapefit.pipeline.map import map_database
@@ -62,6 +62,8 @@ def check_pieces(
         widths = _focal_widths(images[name])
         lenses = (float(widths.min()), float(widths.max()))
         pieces.append(CheckedPiece(folder=name, focal_widths=lenses, facts=found.facts))
+    if not images:
+        raise InputError(f"{folder} holds no COLMAP model that can be read; {pieces[0].error}")
     keep = set(_choose(pieces, images))
     pieces = [replace(one, keep=one.folder in keep) for one in pieces]
     return CheckedPieces(pieces=tuple(pieces), contradictions=(*_compare_lenses(images), *_shared(images)))
@@ -85,8 +87,6 @@ def _choose(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -> Ite
 
 def _compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
     """Yield where models disagree on the focal length of one device."""
-    if not images:
-        return
     names = [name for one in images.values() for name in one.names]
     widths = np.concatenate([_focal_widths(one) for one in images.values()])
     model = np.repeat(np.arange(len(images)), [one.num_images for one in images.values()])

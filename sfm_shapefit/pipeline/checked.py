@@ -1,11 +1,12 @@
 """The verdict on a COLMAP model as it stands, whose matches are open; nothing is placed.
 
 Which pairs contradict the model `judgement.evidence` says. A camera is weak if it sees fewer than 30 points,
-if its reprojection error is above 0.75 px and above twice what is usual, if its points cover less than 15 %
-of the picture, or if more than a third of its pairs contradict it, and more than twice the usual share.
+if its reprojection error is above 0.75 px and above twice what is usual, or if more than a third of its pairs
+contradict it, and more than twice the usual share. How much of the picture its points cover is told, and
+decides nothing: on an object before a plain wall they cover little.
 
-A model is not to be used if its pairs say nothing of where its cameras stand, or for the evidence of
-`judgement.grade`; else its weak cameras are to be looked at.
+A model cannot be judged if it has two cameras only, or if its pairs say nothing of where its cameras stand.
+It is not to be used for the evidence of `judgement.grade`; else its weak cameras are to be looked at.
 
 The limits are set by the bundled scenes and twelve sound models of COLMAP, see "What `check` calls weak" in
 scripts/results/notes.md.
@@ -34,8 +35,9 @@ from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
-from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, Grade, ModelVerdict, weigh_evidence
+from sfm_shapefit.judgement.grade import too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
+from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Grade, Kind, ModelVerdict, Reason, of_each
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -54,7 +56,6 @@ if TYPE_CHECKING:
 
 _FEWEST_POINTS = 30  # points; an image that sees fewer is weak
 _LARGE_PX, _LARGE_OF_USUAL = 0.75, 2.0  # pixels and usual errors; an image whose error is above both is weak
-_LEAST_COVERAGE = 0.15  # share of the picture with points; an image with less is weak
 _ROUNDING = 1e-9  # share of the largest coordinate; cameras no farther apart stand at the same place
 
 
@@ -115,15 +116,18 @@ def check_source(
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     with clock("evidence"):
         evidence = gather_evidence(matches, fits, structure, clock.threads)
-        cameras = _judge_cameras(model, quality, pairs, evidence)
+        weak = list(_find_weak(model.images, quality))
         second = None if fits is None or other is None else _compare(matches, fits, structure, other)
         if fits is not None and second is not None:
             evidence = evidence.beside(second, fits.sides[1])
-    verdict = _grade(model, cameras, fits, evidence, len(matches.matches.missing_names))
+    reasons = list(_reasons(model, weak, fits, evidence, matches))
+    verdict = ModelVerdict.weigh(reasons)
     recognized = recognize_resolution(*structure[:3])
     if verdict.is_bad and recognized is None:
         recognized = ask_convention(matches, clock.threads)
-    verdict = verdict.led_by(recognized.sentence if recognized else "")
+    verdict = verdict.led_by(recognized and Reason(kind=Kind.INPUT, sentence=recognized.sentence))
+    more = (one for one in reasons if one.of_each and one not in weak and one.kind is not Kind.SECOND_OPINION)
+    cameras = _tell_cameras(model, pairs, [*weak, *more])
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, cameras, pairs, quality)
     facts |= {"verdict": verdict, "residual_level_deg": level_deg, "timings_s": clock.seconds}
@@ -166,86 +170,85 @@ def _tell_pairs(images: Images, fits: PairFits) -> list[PairRow]:
     return rows
 
 
-def _judge_cameras(
-    model: ColmapModel, quality: ImageQuality, pairs: list[PairRow], evidence: ModelEvidence
-) -> list[CameraRow]:
+def _tell_cameras(model: ColmapModel, pairs: list[PairRow], weak: list[Reason]) -> list[CameraRow]:
     """Return a row per image, those with a pose first."""
     names = model.images.names
     degrees = Counter(name for pair in pairs if pair.direction for name in (pair.name1, pair.name2))
-    contradicted = {one.camera: one for one in evidence.contradicted}
-    rows = []
-    for k, (name, weak) in enumerate(zip(names, _weaknesses(model.images, quality), strict=True)):
-        if one := contradicted.get(k):
-            weak.append(f"{one.num_against} of its {one.num_pairs} pairs contradict where it stands")
-        center = tuple(model.images.centers[k].tolist())
-        reason = "; ".join(weak)
-        rows.append(
-            CameraRow(name=name, placed=True, reason=reason, piece=0, center=center, degree=degrees[name])
+    rows = [
+        CameraRow(
+            name=name,
+            placed=True,
+            reason="; ".join(one.sentence for one in weak if name in one.images),
+            piece=0,
+            center=tuple(center),
+            degree=degrees[name],
         )
+        for name, center in zip(names, model.images.centers.tolist(), strict=True)
+    ]
     others = set(model.image_names) - set(names)
     return rows + [CameraRow(name=name, reason="it has no pose in the model") for name in sorted(others)]
 
 
-def _weaknesses(images: Images, quality: ImageQuality) -> Iterator[list[str]]:
-    """Yield what is weak about how points hold each image, in words; a frame is held by one of its images."""
+def _find_weak(images: Images, quality: ImageQuality) -> Iterator[Reason]:
+    """Yield what is weak about how points hold each image; a frame is held by one of its images."""
     usual_px = _median(quality.errors_px[np.isfinite(quality.errors_px)].tolist())
-    num_points, coverage = np.zeros((2, len(images.frames.ids)))
+    num_points = np.zeros(len(images.frames.ids))
     np.maximum.at(num_points, images.frame_of, quality.num_points)
-    np.maximum.at(coverage, images.frame_of, quality.coverage)
+    has_points = len(quality.point_errors_px) > 0  # a lack of all is said of the whole model
     for k, frame in enumerate(images.frame_of.tolist()):
-        weak = []
-        if len(quality.point_errors_px) == 0:
-            pass  # said of the whole model
-        elif num_points[frame] < _FEWEST_POINTS:
+        if has_points and num_points[frame] < _FEWEST_POINTS:
             seen = f"only {quality.num_points[k]}" if quality.num_points[k] else "no"
-            weak.append(f"it sees {seen} 3D points")
-        elif coverage[frame] < _LEAST_COVERAGE:
-            weak.append(f"its points cover only {quality.coverage[k]:.0%} of the picture")
+            yield from of_each(Kind.POINTS, images.names[k : k + 1], f"it sees {seen} 3D points")
         if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual_px):
             error_px = quality.errors_px[k]
-            weak.append(f"its reprojection error is {error_px:.1f} px, where {usual_px:.1f} px is usual")
-        yield weak
+            clause = f"its reprojection error is {error_px:.1f} px, where {usual_px:.1f} px is usual"
+            yield from of_each(Kind.POINTS, images.names[k : k + 1], clause)
 
 
-def _grade(
+def _reasons(
     model: ColmapModel,
-    cameras: list[CameraRow],
+    weak: list[Reason],
     fits: PairFits | None,
     evidence: ModelEvidence,
-    num_missing: int,
-) -> ModelVerdict:
-    """Return the verdict on a model; a weak camera that stands where another model has it is right.
-
-    Its database lacks `num_missing` images.
-    """
-    against = weigh_evidence(evidence, model.images)
+    matches: MatchSource,
+) -> Iterator[Reason]:
+    """Yield what speaks against a model; a weak camera that stands where another model has it is right."""
+    pointless = model.reconstruction.num_points3D() == 0
+    yield from _reasons_against(model.images, fits, is_bare=pointless and not matches.inputs.database)
+    yield from too_few_to_judge(model.images.num_images)
+    against = list(weigh_evidence(evidence, model.images))
+    yield from against
+    if fits is not None and not any(one.grade is Grade.DO_NOT_USE for one in against):
+        yield from _strange_pairs(fits)
     confirmed = [] if evidence.second is None else evidence.second.confirmed.tolist()
     right = {model.images.names[k] for k in confirmed}
-    weak = (row.name for row in cameras if row.placed and row.reason and row.name not in right)
-    named = tuple(dict.fromkeys([*against.cameras, *weak]))
-    if bad := (*_reasons_against(model.images, fits),) or against.reasons or (*_strange_pairs(fits),):
-        return ModelVerdict(grade=Grade.DO_NOT_USE, cameras=named, reasons=bad)
-    pointless = model.reconstruction.num_points3D() == 0
-    reasons = ("it has no 3D points, so that only matches say where its cameras stand",) if pointless else ()
-    if num_missing:
-        reasons = (*reasons, f"the database lacks {counted(num_missing, 'image')}: {IS_ITS_DATABASE}")
-    reasons = (*reasons, *against.suspicions)
-    return ModelVerdict(grade=Grade.LOOK if named or reasons else Grade.GOOD, cameras=named, reasons=reasons)
+    yield from (one for one in weak if not right.issuperset(one.images))
+    if pointless:
+        clause = "it has no 3D points, so that only matches say where its cameras stand"
+        yield Reason(kind=Kind.POINTS, sentence=clause)
+    if num_missing := len(matches.matches.missing_names):
+        clause = f"the database lacks {counted(num_missing, 'image')}: {IS_ITS_DATABASE}"
+        yield Reason(kind=Kind.INPUT, sentence=clause)
 
 
-def _reasons_against(images: Images, fits: PairFits | None) -> Iterator[str]:
-    """Yield why a model should not be used, a clause each."""
+def _reasons_against(images: Images, fits: PairFits | None, *, is_bare: bool) -> Iterator[Reason]:
+    """Yield that a model has no shape, or that no pair says anything of it; poses alone are bare."""
     if np.ptp(images.centers, axis=0).max() <= _ROUNDING * np.abs(images.centers).max():
-        yield "all its cameras stand at the same place; place them with sfm-shapefit locate"
+        clause = "all its cameras stand at the same place; place them with sfm-shapefit locate"
+        yield Reason(kind=Kind.PLACE, sentence=clause, grade=Grade.DO_NOT_USE)
     elif fits is None or not (fits.contradicts.any() or np.isfinite(fits.residuals_deg).any()):
-        yield "no two of its images have matches that say how they stand to each other"
+        clause = "no two of its images have matches that say how they stand to each other"
+        clause = "it has no 3D points, and no database was given or found" if is_bare else clause
+        yield Reason(kind=Kind.UNCHECKED, sentence=clause, grade=Grade.CANNOT_BE_JUDGED)
 
 
-def _strange_pairs(fits: PairFits | None) -> Iterator[str]:
+def _strange_pairs(fits: PairFits) -> Iterator[Reason]:
     """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
-    if fits is not None and fits.contradicts.any() and not fits.agrees.any():
-        against = counted(int(fits.contradicts.sum()), "pair")
-        yield f"{against} contradict it and none agrees: {IS_ITS_DATABASE}"
+    if fits.contradicts.any() and not fits.agrees.any():
+        clause = (
+            f"{counted(int(fits.contradicts.sum()), 'pair')} contradict it and none agrees: {IS_ITS_DATABASE}"
+        )
+        yield Reason(kind=Kind.INPUT, sentence=clause, grade=Grade.DO_NOT_USE)
 
 
 def _tell(

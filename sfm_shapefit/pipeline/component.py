@@ -12,6 +12,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.map_result import MappedModel
 from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.scene import Loop
+from sfm_shapefit.judgement.reasons import Kind, Reason
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.acting import act, at_one_center
 from sfm_shapefit.pipeline.components import pairs_among
@@ -149,12 +150,13 @@ def _false_pairs(images: Images, among: RelativeRotations, averaging: AveragedRo
     return frozenset((min(pair), max(pair)) for pair in names)
 
 
-def _suspicions(averaging: AveragedRotations) -> Iterator[str]:
+def _suspicions(averaging: AveragedRotations) -> Iterator[Reason]:
     """Yield why a model is to be looked at, whatever its pairs say: they say the same of a folded scene."""
     if averaging.num_repeated:
-        yield "the scene repeats itself, and pairs that would fold it were not followed"
+        clause = "the scene repeats itself, and pairs that would fold it were not followed"
+        yield Reason(kind=Kind.REPEATED, sentence=clause)
     if averaging.num_rivals:
-        yield "the images can be arranged in another way"
+        yield Reason(kind=Kind.REPEATED, sentence="the images can be arranged in another way")
 
 
 def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) -> Iterator[Loop]:

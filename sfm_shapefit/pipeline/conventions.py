@@ -13,7 +13,7 @@ from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.conventions import PoseFile, Recognized, recognize_convention
-from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, Grade
+from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Grade, Kind, Reason
 from sfm_shapefit.judgement.resolutions import recognize_resolution, recognize_sizes
 from sfm_shapefit.pipeline.doubts import ask_rotations, rank_within
 from sfm_shapefit.pipeline.inputs import MatchSource
@@ -85,7 +85,8 @@ def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> L
     recognized = _ask_input(source, threads) if is_asked else None
     if recognized is None:
         return found
-    others = tuple(reason for reason in found.suspicions if not reason.endswith(IS_ITS_DATABASE))
+    others = tuple(one for one in found.suspicions if not one.sentence.endswith(IS_ITS_DATABASE))
     first = recognized.sentence + ("; other warnings may come of that" if found.warnings else "")
     warnings = (first, *found.warnings)
-    return replace(found, recognized=recognized.clause, suspicions=others, warnings=warnings)
+    reason = Reason(kind=Kind.INPUT, sentence=recognized.clause)
+    return replace(found, recognized=reason, suspicions=others, warnings=warnings)

@@ -9,7 +9,6 @@ is known. Errors of a join come on top, as if they moved each camera of the mode
 The verdict is no better than that of any of the models.
 """
 
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -30,7 +29,7 @@ from sfm_shapefit.facts.tables import CameraRow
 from sfm_shapefit.files.colmap.images import name_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import transform_model
-from sfm_shapefit.judgement.grade import Grade, ModelVerdict
+from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.checked import check_source
 from sfm_shapefit.pipeline.clock import Clock
@@ -197,11 +196,15 @@ def _errors(
 
 
 def _judge(seen: ModelVerdict, group: JoinedGroup, located: Mapping[int, LocateResult]) -> ModelVerdict:
-    """Return the verdict: what was seen of the joined model, and those of its models."""
-    verdicts = {number: located[number].verdict for number in group.world_from if number in located}
-    grades = [verdict.grade for verdict in verdicts.values()]
-    worst = max([seen.grade, *grades], key=list(Grade).index)
-    named = (verdict.cameras for verdict in (*verdicts.values(), seen))
-    cameras = dict.fromkeys(itertools.chain.from_iterable(named))
-    said = tuple(f"model {k}: {reason}" for k, verdict in verdicts.items() for reason in verdict.reasons)
-    return ModelVerdict(grade=worst, cameras=tuple(cameras), reasons=(*seen.reasons, *said))
+    """Return the verdict: what was seen of the joined model, and what made its models no better.
+
+    One that could not be judged by itself is judged in it.
+    """
+    said = [
+        one if one.of_each else replace(one, sentence=f"model {number}: {one.sentence}")
+        for number in group.world_from
+        if number in located
+        for one in located[number].verdict.findings
+        if one.grade is not Grade.CANNOT_BE_JUDGED
+    ]
+    return ModelVerdict.weigh([*said, *seen.findings])

@@ -42,6 +42,7 @@ from sfm_shapefit.judgement.doubted import confirm_cameras
 from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.judgement.limits import RARE
+from sfm_shapefit.judgement.reasons import Kind, Reason
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_cameras, turned_deg, with_uncertainty
@@ -201,7 +202,7 @@ def finish_piece(
         intrinsics=intrinsics,
         rigs=rigs,
         control_points=control,
-        suspicions=stand.failures,
+        suspicions=tuple(Reason(kind=Kind.FAILED, sentence=one) for one in stand.failures),
     )
     return replace(found, warnings=(*_warnings(found, stand), *told))
 

@@ -8,7 +8,7 @@ import numpy as np
 from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.facts.model import CheckedFacts, FactsOfModel, JoinedFacts, ModelFacts
 from sfm_shapefit.facts.placed import IN_MEMORY, Facts, GraphFacts, scope_of
-from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.report.drawing import Drawing, PairClass
 from sfm_shapefit.report.sentences import MAX_TEXT, placed_sentence, shorten
 
@@ -61,7 +61,9 @@ def _headline(drawing: Drawing, facts: Facts) -> str:
         return f"Good: this {'graph is placed' if drawing.noun == 'node' else 'model can be used'}"
     if facts.verdict.grade is Grade.LOOK:
         return f"Look at {counted(cameras, drawing.noun)} first" if cameras else "Look before you use it"
-    return "Do not use this model"
+    return (
+        "This cannot be judged" if facts.verdict.grade is Grade.CANNOT_BE_JUDGED else "Do not use this model"
+    )
 
 
 def _sentence(drawing: Drawing, facts: Facts) -> str:
@@ -81,10 +83,9 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
     if facts.verdict.grade is not Grade.LOOK or not facts.verdict.cameras:
         return f"{reasons}." if reasons else ""
     placed = set(np.array(drawing.cameras.names)[drawing.cameras.placed].tolist())
-    reason_of = dict(zip(drawing.cameras.names, drawing.cameras.reasons, strict=True))
     doubted = [name for name in facts.verdict.cameras if name in placed]
     left_out = [name for name in facts.verdict.cameras if name not in placed]
-    is_weak = is_checked and all(reason_of[name] for name in doubted)
+    is_weak = all(one.kind is Kind.POINTS for one in facts.verdict.findings if one.images)
     weak = f"{'is' if len(doubted) == 1 else 'are'} weak" if is_weak else "may be wrong"
     parts = [f"{_named(doubted)} {weak}"] if doubted else []
     if left_out:

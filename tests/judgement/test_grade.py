@@ -7,8 +7,9 @@ import pytest
 
 from sfm_shapefit import synthetic
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.grade import NOTHING_AGAINST, Grade, judge_graph, weigh_evidence
+from sfm_shapefit.judgement.grade import judge_graph, weigh_evidence
 from sfm_shapefit.judgement.places import OtherPlace
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.support import ObservationShares
 from sfm_shapefit.judgement.ties import Untied
@@ -38,6 +39,7 @@ def test_a_sound_model_is_good(found):
         "statement": "good",
         "cameras": [],
         "reasons": [],
+        "findings": [],
     }
 
 
@@ -189,9 +191,8 @@ def test_a_model_a_third_of_which_is_named_is_not_to_be_used_and_a_small_seam_is
     assert verdict.reasons == ("evidence speaks against 3 of 8 cameras",)
     images = replace(found.placed, lens_of=np.zeros(8, dtype=int))
     large = images.part(np.zeros(0, dtype=int))
-    assert weigh_evidence(ModelEvidence(), large) == NOTHING_AGAINST
-    against = weigh_evidence(few, images)
-    assert (against.suspicions, against.reasons) == ((), ())
+    assert list(weigh_evidence(ModelEvidence(), large)) == []
+    assert all(one.of_each for one in weigh_evidence(few, images))
 
 
 def test_images_that_are_not_placed_are_told_and_count(found):

@@ -111,7 +111,9 @@ def test_lenses_of_one_device_are_alike(scatter):
     for one in found:
         off = np.abs(np.log(focals / np.median(focals)))
         assert one.cameras.tolist() == np.flatnonzero(off > 0.1).tolist()
-        assert f"{focals.min():.2f} to {focals.max():.2f} picture widths" in one.details
+        assert (
+            f"{focals[one.cameras].min():.2f} to {focals[one.cameras].max():.2f} picture widths" in one.what
+        )
         assert not one.cannot_be
 
 

@@ -11,7 +11,7 @@ from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import ModelPictures, points_of
-from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.support import (
     ObservationCounts,
     PartnerCounts,

@@ -12,8 +12,8 @@ import sfm_shapefit
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.judgement.places import OtherPlace
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pipeline.acting import find_remedy
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, see_matches

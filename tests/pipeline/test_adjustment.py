@@ -12,7 +12,7 @@ import sfm_shapefit
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pipeline.settle import _start
 from tests.models import posed
 from tests.scenes import COURTYARD, RING, copied, edit_database

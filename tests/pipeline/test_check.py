@@ -182,12 +182,13 @@ def test_a_wrong_model_is_not_to_be_used(tmp_path, place, with_database, words):
     assert run("check", model, "--no-second-opinion", *database, "-q", code=0).output == ""
 
 
-def test_a_model_that_nothing_speaks_for_is_not_to_be_used(tmp_path):
+def test_a_model_that_nothing_speaks_for_does_not_pass_strict(tmp_path):
     model = RING / "sparse" / "0"
     others = run("check", model, "--database", COURTYARD / "database.db", "--strict", code=4)
     assert "do not use" in others.stdout
     alone = spoiled(tmp_path / "alone", points=False)
-    assert "no two of its images have matches" in run("check", alone, "--strict", code=4).stdout
+    judged = run("check", alone, "--strict", code=4).stdout
+    assert "verdict: cannot be judged: it has no 3D points, and no database was given or found" in judged
     strangers = spoiled(tmp_path / "strangers", names="other-{}".format)
     database = ("--database", RING / "database.db")
     assert "has 0 of the model's 8 images" in run_refused("check", strangers, *database)
@@ -230,9 +231,9 @@ def test_a_second_opinion_of_another_shape_is_a_reason_to_look(tmp_path):
     rows = {"wrong": none, "undecided": none, "confirmed": none, "ambiguous": none}
     images = read_model(RING / "sparse/0").images
     told = "the model that map makes of the same database has another shape"
-    for share, suspicions in ((0.05, ()), (0.4, (told,))):
+    for share, said in ((0.05, []), (0.4, [told])):
         evidence = ModelEvidence(second=SecondOpinion(usual=share, **usual, **rows))
-        assert weigh_evidence(evidence, images).suspicions == suspicions
+        assert [one.sentence for one in weigh_evidence(evidence, images)] == said
 
 
 def test_a_model_without_points_is_told_once_and_judged_by_its_pairs(tmp_path, ring_mapped):

@@ -10,7 +10,7 @@ import sfm_shapefit
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import FLIP_YZ, fit_similarity
 from sfm_shapefit.judgement.conventions import recognize_convention
-from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.convert import convert

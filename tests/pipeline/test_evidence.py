@@ -10,7 +10,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline import evidence, settle
 from sfm_shapefit.pipeline.check import check

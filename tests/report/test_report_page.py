@@ -16,7 +16,7 @@ from sfm_shapefit.facts.intrinsics import CameraIntrinsics
 from sfm_shapefit.facts.model import BundleAdjustment
 from sfm_shapefit.facts.placed import IN_MEMORY, KeyFigures
 from sfm_shapefit.facts.tables import CameraRow
-from sfm_shapefit.judgement.grade import Grade, ModelVerdict
+from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.report import thumbnails
 from sfm_shapefit.report.charts import (
     reprojection_error_bars,

@@ -7,7 +7,7 @@ const drawHead = () => {
   $("banner").dataset.grade = banner.grade;
   $("h-cameras").textContent = `${capital(data.noun)}s`;
   $("h-matrix").textContent = `Which ${data.noun}s are paired`;
-  $("mark").textContent = { good: "✓", look: "!", "do not use": "✕" }[banner.grade] ?? "";
+  $("mark").textContent = { good: "✓", look: "!", "cannot be judged": "?", "do not use": "✕" }[banner.grade] ?? "";
   $("verdict").textContent = banner.headline;
   $("why").textContent = banner.sentence;
   if (banner.command) {
