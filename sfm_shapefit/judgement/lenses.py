@@ -13,8 +13,8 @@ cos^4 theta = 0.4 %, or pixels finer than 0.5 seconds of arc, which the air blur
 unusual, as where COLMAP drops images for parameters that change distances by more than a tenth. A long focal
 length alone, or large coefficients that cancel, are neither.
 
-Where points tell, the deviation is to be more than fits (4 px) at the distance within which 95 % of them lie:
-in small pictures, and where an object fills their middle, coefficients say nothing of the corners.
+Where there are points, it is to deviate by more than fits (4 px) at the distance within which 95 % of them
+lie: in small pictures, and where an object fills their middle, coefficients say nothing of the corners.
 
 Focal lengths of images that one device took (`scene.sequences`) differ by a tenth, by the median, only if
 they are not determined or if it zoomed. On nine sound models, each of whose images had a lens of its own,
@@ -38,12 +38,11 @@ from sfm_shapefit.scene.sequences import find_sequences
 
 _LEAST_OF_SINE, _MOST_OF_TANGENT, _USUAL_OF_TANGENT = 0.95, 1.5, 1.15  # factors of the limits; see the header
 _WIDEST_DEG, _FINEST_PX = 150.0, 412_530.0  # degrees; focal length in pixels where one is 0.5 seconds of arc
-_REACHED = 0.95  # share of the observations of a lens within the distance up to which points tell
+_REACHED = 0.95  # share of the observations of a lens; those farther out are few, or false
 _ASKED = 0.7  # share of the shorter side up to which fisheyes are asked; their pictures may end there
-_AT_CENTER = 0.02  # share of the way to the edge where the distortion is none yet
-_ALONG = np.array(
-    [_AT_CENTER, 0.2, 0.4, 0.6, 0.8, 1.0]
-)  # shares of the way to the edge where a lens is asked
+# Shares of the way to the edge where a lens is asked; at the first, there is no distortion yet.
+_ALONG = np.array([0.02, 0.2, 0.4, 0.6, 0.8, 1.0])
+# Ways to the edges and corners; distortion is largest along the diagonals.
 _AROUND = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]], dtype=np.float64)
 
 
