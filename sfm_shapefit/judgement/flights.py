@@ -64,14 +64,14 @@ def _leaps(centers: FloatArray, numbers: IntArray, least: float) -> FloatArray:
     steps, some = _distances(centers[1:], centers[:-1]), centers[:: -(-count // MOST_COMPARED)]
     if count < _SHORTEST_PATH or np.median(steps) > _SHORT_STEP * np.median(_distances(some[:, None], some)):
         return found
-    speeds = steps / np.diff(numbers)
+    speeds = steps / np.maximum(np.diff(numbers), 1)
     for num in range(1, _MOST_IN_A_ROW + 1):
-        for before in range(count - num - 1):
+        for before in np.flatnonzero(steps[: count - num - 1] > least).tolist():
             ends, row = np.array([before, before + num + 1]), slice(before + 1, before + num + 1)
             near = np.r_[speeds[max(0, before - _NEARBY) : before], speeds[ends[1] :][:_NEARBY]]
             usual = SIGMAS * np.quantile(near, _LONG_STEP) * np.abs(numbers[ends][:, None] - numbers[row])
             far = _distances(centers[ends][:, None], centers[row])
-            across = OUTNUMBERED * _distances(*centers[ends])
+            across = OUTNUMBERED * float(_distances(*centers[ends]))
             if (far > np.maximum(usual, max(across, least))).all() and not found[ends].any():
                 found[row] = far.min(axis=0)
     return found
