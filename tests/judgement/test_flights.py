@@ -71,9 +71,11 @@ def test_no_sound_way_of_taking_pictures_is_a_leap_or_a_flight():
 
 
 def test_frames_that_are_missing_between_two_explain_a_long_way():
-    centers = walk(np.random.default_rng(1), 3 * COUNT)
-    kept = np.sort(np.random.default_rng(2).choice(3 * COUNT, COUNT, replace=False))
-    assert flights(centers[kept], [f"{k:05}.png" for k in kept.tolist()])[0] == []
+    out = np.c_[np.arange(21.0), np.zeros((21, 2))]
+    there_and_back = np.concatenate([out, [[30.0, 0.0, 0.0]], out[::-1]])
+    slow, fast = ([*range(21), 20 + gap, *range(20 + 2 * gap, 41 + 2 * gap)] for gap in (10, 1))
+    assert flights(there_and_back, [f"{k:05}.png" for k in slow])[0] == []
+    assert flights(there_and_back, [f"{k:05}.png" for k in fast])[0] == [21]
 
 
 def test_a_camera_at_rest_in_a_large_scene_does_not_leap():
