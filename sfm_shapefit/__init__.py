@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pairs.options import DirectionOptions
     from sfm_shapefit.pipeline.adjust import AdjustedModel, bundle_adjust
     from sfm_shapefit.pipeline.check import check
+    from sfm_shapefit.pipeline.check_pieces import check_pieces
     from sfm_shapefit.pipeline.checked import CheckResult
     from sfm_shapefit.pipeline.convert import convert
     from sfm_shapefit.pipeline.drop_in import average_database, global_mapping
@@ -71,6 +72,7 @@ _HOMES = {
     "adjustment.options": ("AdjustmentOptions",),
     "pipeline.adjust": ("AdjustedModel", "bundle_adjust"),
     "pipeline.check": ("check",),
+    "pipeline.check_pieces": ("check_pieces",),
     "pipeline.checked": ("CheckResult",),
     "pipeline.convert": ("convert",),
     "pipeline.drop_in": ("average_database", "global_mapping"),
@@ -140,6 +142,7 @@ __all__ = [
     "bundle_adjust",
     "certify",
     "check",
+    "check_pieces",
     "convert",
     "evaluate",
     "global_mapping",

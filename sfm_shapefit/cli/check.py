@@ -14,6 +14,7 @@ from sfm_shapefit.cli.console import (
     print_answer,
     print_ending,
     print_json,
+    print_lines,
     report_errors,
     show_progress,
 )
@@ -70,11 +71,18 @@ def check_command(
 
     A camera is weak if it sees few points, if its errors are large, or if many pairs
     contradict it. Pairs come from the database, else from the model's tracks.
+    A folder of several models, as sparse with 0 and 1, gets one table, and which of them to keep.
     """
     source = one_path(model, input_path, "MODEL")
     with report_errors():
-        from sfm_shapefit.files.model_folder import refuse_no_model
+        from sfm_shapefit.files.model_folder import model_folders, refuse_no_model
 
+        if len(model_folders(source)) > 1:
+            for flag, path in (("--report", report), ("--second-opinion", second_opinion)):
+                if path is not None:
+                    raise InputError(f"{flag} is of one model; give one of the folder's, or leave it out")
+            is_usable = _check_pieces(source, database, not no_second_opinion, as_json=as_json, quiet=quiet)
+            raise typer.Exit(EXIT_UNSOLVABLE if strict and not is_usable else 0)
         refuse_no_model(source)
         from sfm_shapefit.base.atomic_folder import claimed_output
         from sfm_shapefit.files.colmap.database import find_database
@@ -126,3 +134,22 @@ def _keep_second(found: "CheckResult", out: Path | None, *, overwrite: bool) -> 
         return replace(found, facts=replace(found.facts, warnings=[*found.facts.warnings, note]))
     found.second_opinion.write(out, overwrite=overwrite)
     return replace(found, facts=replace(found.facts, second_opinion=str(out)))
+
+
+def _check_pieces(
+    folder: Path, database: Path | None, second_opinion: bool, *, as_json: bool, quiet: bool
+) -> bool:
+    """Judge the models in a folder, print one table, and return whether one of them is to be kept."""
+    from sfm_shapefit.files.colmap.quiet import hear_pycolmap
+    from sfm_shapefit.pipeline.check_pieces import check_pieces
+
+    with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
+        found = check_pieces(folder, database, second_opinion=second_opinion, progress=progress)
+    if as_json:
+        print_json(found.summary())
+    elif not quiet:
+        told = found.told
+        print_answer(told)
+        if told.step.command:
+            print_lines([f"next: {told.step.command}"])
+    return bool(found.kept)

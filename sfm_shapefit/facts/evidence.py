@@ -68,6 +68,20 @@ class AmbiguousPlace(Record):
         )
 
 
+class OddImages(Record):
+    """Images that hardly can be as the model has them: through such a lens, or at such a place."""
+
+    images: Annotated[tuple[str, ...], "Their names."]
+    what: Annotated[str, "What each of them has: a lens or a place, and what is odd about it."]
+    cannot_be: Annotated[bool, "Whether that is impossible, and not only unusual."]
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        has = "has" if len(self.images) == 1 else "have"
+        return f"{counted(len(self.images), 'image')} ({first_of(self.images)}) {has} {self.what}"
+
+
 class _Group(Record):
     """A group of cameras, and the pairs between it and the rest."""
 
@@ -178,6 +192,9 @@ class ToldEvidence(Record):
     """Evidence that the fit did not use, against lenses, cameras and groups by name."""
 
     lenses: Annotated[tuple[ContradictedLens, ...], "Lenses whose images ask for another focal length."] = ()
+    odd: Annotated[
+        tuple[OddImages, ...], "Images with lenses that hardly can be, or that stand far from all others."
+    ] = ()
     places: Annotated[tuple[AmbiguousPlace, ...], "Cameras that two sets of pairs put at two places."] = ()
     seams: Annotated[tuple[GroupApart, ...], "Groups of cameras that stand apart from the rest."] = ()
     untied: Annotated[tuple[UntiedGroup, ...], "Groups of cameras that little ties to the rest."] = ()
@@ -196,6 +213,7 @@ class ToldEvidence(Record):
     def statements(self) -> list[str]:
         """A sentence for each."""
         told = [
+            *(one.statement for one in self.odd),
             *(one.statement for one in self.seams),
             *(one.statement for one in self.untied),
             *(one.statement for one in self.places),
@@ -225,6 +243,10 @@ def tell_evidence(
     """
     return ToldEvidence(
         lenses=tuple(_tell_lens(wrong, images.lenses[wrong.lens]) for wrong in evidence.lenses),
+        odd=tuple(
+            OddImages.taken_from(one, images=tuple(images.names[k] for k in one.cameras.tolist()))
+            for one in evidence.oddities
+        ),
         places=tuple(
             AmbiguousPlace.taken_from(
                 found,

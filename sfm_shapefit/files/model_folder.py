@@ -20,6 +20,17 @@ def refuse_no_model(path: Path | None) -> None:
         model_suffix(path)
 
 
+def model_folders(folder: Path) -> list[Path]:
+    """Return the models in a folder that has none itself, by the numbers that COLMAP's mapper gives."""
+    try:
+        inner = [entry for entry in folder.iterdir() if entry.name.isdecimal()]
+        has_own = any((folder / f"images{suffix}").exists() for suffix in (".bin", ".txt"))
+        models = [one for one in inner if any((one / f"images{s}").is_file() for s in (".bin", ".txt"))]
+    except OSError:  # what cannot be read is refused as a model
+        return []
+    return [] if has_own else sorted(models, key=lambda one: int(one.name))
+
+
 def model_suffix(folder: Path) -> str:
     """Return ".bin" or ".txt": the format in which pycolmap would read the model in `folder`.
 

@@ -8,6 +8,7 @@ it has none at all. Half of the pairs between fisheyes in a park know theirs wor
 though the model is sound.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, exte
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, OUTNUMBERED, RARE, SIGMAS, SURE_SIGMAS
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
-from sfm_shapefit.judgement.reasons import Grade
+from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.uncertainty import standard_deviations
@@ -39,6 +40,36 @@ class Contradicted(NamedTuple):
     """Pairs with a direction."""
     num_against: int
     """Pairs of these that contradict where it stands."""
+
+
+class Oddity(NamedTuple):
+    """Images that hardly can be as the model has them: through such a lens, or at such a place."""
+
+    kind: Kind
+    """Whether it is the lens of each, or its place."""
+    cannot_be: bool
+    """Whether that is impossible, and not only unusual."""
+    cameras: IntArray
+    """(k,) their rows."""
+    values: FloatArray
+    """(k,) what is odd about each."""
+    sentence: str
+    """What that is, with {} for the value."""
+
+    @property
+    def what(self) -> str:
+        """What they have, a lens or a place, with the least and the largest value."""
+        return self._say(self.values)
+
+    @property
+    def of_each(self) -> Iterator[tuple[int, str]]:
+        """The row of each, and what it has."""
+        for row, camera in enumerate(self.cameras.tolist()):
+            yield camera, self._say(self.values[row : row + 1])
+
+    def _say(self, values: FloatArray) -> str:
+        told = [f"{value:,.{0 if value >= 10.0 else 2}f}" for value in (values.min(), values.max())]
+        return self.sentence.format(" to ".join(dict.fromkeys(told)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -204,6 +235,8 @@ class ModelEvidence:
     """By rows of the images; those that the pixels confirm are not among them."""
     untied: tuple[Untied, ...] = ()
     """By rows of the images; those that stand apart are not among them."""
+    oddities: tuple[Oddity, ...] = ()
+    """By rows of the images."""
     num_held: int | None = None
     """Cameras of the largest group that agreeing pairs, or points that fit, hold; None without pairs."""
     second: SecondOpinion | None = None

@@ -11,12 +11,13 @@ Do not use, if any of these holds:
     model of the same matches, which pairs support there (`second_opinion`); who stands where it does is to
     be looked at only
     evidence that the fit did not use speaks against more than a third of them (`evidence`), but for these
+    more than a tenth of the images, and two or more, have lenses that cannot be (`lenses`)
 
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
 placed but are not in the output, that are kept though their matches make no points, that many pairs
 contradict and no pixels confirm (`witnesses`), or that evidence which the fit did not use names: another
-place, a seam, a wrong lens. Trust is not low where the pixels confirm a camera. Look also, though no camera
-can be named, if
+place, a seam, a wrong lens, a lens or a place that hardly can be (`lenses`, `flights`). Trust is not low
+where the pixels confirm a camera. Look also, though no camera can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade
     many rejected pairs agree on a second configuration
@@ -107,6 +108,7 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     if evidence.shape is not None and len(evidence.shape.cameras):
         clause = f"its own points leave the shape open, {how_far(evidence.shape.largest)}"
         yield of_model(Kind.UNCERTAIN, clause, images=names(evidence.shape.cameras.tolist()))
+    yield from _weigh_oddities(evidence, images)
     for one in evidence.contradicted:
         clause = f"{one.num_against} of its {one.num_pairs} pairs contradict where it stands"
         yield from of_each(Kind.PAIRS, names([one.camera]), clause)
@@ -120,6 +122,23 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
         if second.has_nothing_in_common:
             clause = "the model that map makes of the same database has another shape"
             yield of_model(Kind.APART, clause)
+
+
+def _weigh_oddities(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
+    """Yield which lenses and places hardly can be: of few images of each, of more as one."""
+    few = max(FEW * int(images.is_posed.sum()), 1)
+    are_many = sum(len(one.cameras) for one in evidence.oddities if one.cannot_be) > few
+    for one in sorted(evidence.oddities, key=lambda one: -len(one.cameras)):
+        number = len(one.cameras)
+        is_bad = one.cannot_be and are_many
+        if is_bad or number > few:
+            clause = f"{counted(number, 'image')} {'has' if number == 1 else 'have'} {one.what}"
+            names = tuple(images.names[camera] for camera in one.cameras.tolist())
+            grade = Grade.DO_NOT_USE if is_bad else Grade.LOOK
+            yield of_model(one.kind, clause, images=names, grade=grade)
+        else:
+            for camera, what in one.of_each:
+                yield from of_each(one.kind, [images.names[camera]], f"it has {what}")
 
 
 def _find_apart(evidence: ModelEvidence) -> tuple[list[int], str]:

@@ -7,7 +7,10 @@ import numpy as np
 from sfm_shapefit.adjustment.open_shape import estimate_open_shape
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.files.colmap.lenses import is_bogus
 from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape, PairFits
+from sfm_shapefit.judgement.flights import find_flights
+from sfm_shapefit.judgement.lenses import find_odd_lenses
 from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED, SMALLEST_SHAPE
 from sfm_shapefit.judgement.seams import Seam, find_cuts, find_seams
 from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, links_of_pairs, rigid_groups
@@ -49,8 +52,10 @@ def gather_evidence(
     """
     points, images, pictures, among, asked = structure
     _, lenses = question_lenses(points, images, pictures, threads, among, _ask_some(images, asked))
+    bogus = np.array([is_bogus(lens) for lens in images.lenses], dtype=np.bool_)
+    odd = (*find_odd_lenses(images, points, pictures, bogus), *find_flights(images))
     if fits is None:
-        return ModelEvidence(lenses=lenses)
+        return ModelEvidence(lenses=lenses, oddities=odd)
     tied, untied = _tie(source, fits, structure)
     cuts, seams = find_cuts(*fits.sides, tied), tuple[Seam, ...]()
     if cuts:  # which are seams by the rotations that pairs across have by themselves
@@ -62,6 +67,7 @@ def gather_evidence(
     sure = ask_pixels(source, structure, doubted)
     return ModelEvidence(
         lenses=lenses,
+        oddities=odd,
         places=fits.other_places(),
         seams=seams,
         contradicted=tuple(one for one in contradicted if not sure[one.camera]),

@@ -9,6 +9,11 @@ from sfm_shapefit.scene.lens import Lens
 _ONE_TO_ONE = ("SIMPLE_PINHOLE", "PINHOLE")
 # Distance in pixels by which a pixel may miss itself over its ray and back; solving for the ray leaves 1e-8.
 _ROUND_TRIP_PX = 0.01
+_MAPPER_ALLOWS = (
+    0.1,
+    10.0,
+    1.0,
+)  # focal lengths in longer sides, and other parameters; defaults of COLMAP's mapper
 
 
 def camera_of(lens: Lens) -> pycolmap.Camera:
@@ -32,6 +37,11 @@ def lens_of(camera: pycolmap.Camera) -> Lens:
         width=int(camera.width),
         height=int(camera.height),
     )
+
+
+def is_bogus(lens: Lens) -> bool:
+    """Return whether COLMAP's mapper drops images for the parameters of their lens."""
+    return bool(camera_of(lens).has_bogus_params(*_MAPPER_ALLOWS))
 
 
 def rays_of(lens: Lens, pixels: FloatArray) -> FloatArray:

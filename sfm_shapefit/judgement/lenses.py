@@ -1,0 +1,182 @@
+"""Lenses that cannot be, or hardly: by their focal length, their distortion over the picture, and like ones.
+
+A pixel at the distance rho from the principal point, in focal lengths at the center of the picture, sees a
+ray at the angle theta from the axis. All lenses that are made lie between two limits:
+
+    sin theta <= rho <= tan theta        the orthographic fisheye, and the perspective of a pinhole
+
+Zoom and telephoto lenses are beyond either by a few percent. So a lens cannot be if somewhere in the picture
+rho is less than 0.95 sin theta or more than 1.5 tan theta (a flat port under water, as wide as they are made,
+has 1.3), if its distortion turns back within the circle around the center that touches the nearer edges, or
+if it has 150 degrees or more along the longer edge without the compression of a fisheye, where light falls to
+cos^4 theta = 0.4 %, or pixels finer than 0.5 seconds of arc, which the air blurs. Beyond 1.15 tan theta it is
+unusual, as where COLMAP drops images for parameters that change distances by more than a tenth. A long focal
+length alone, or large coefficients that cancel, are neither.
+
+Where there are points, it is to deviate by more than fits (4 px) at the distance within which 95 % of them
+lie: in small pictures, and where an object fills their middle, coefficients say nothing of the corners.
+
+Focal lengths of images that one device took (`scene.sequences`) differ by a tenth, by the median, only if
+they are not determined or if it zoomed. On nine sound models, each of whose images had a lens of its own,
+they differ by 0.05 % to 4 %.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
+from sfm_shapefit.judgement.evidence import Oddity
+from sfm_shapefit.judgement.limits import FEW, FITTING_PX, HALF, SMALLEST_SHAPE
+from sfm_shapefit.judgement.reasons import Kind
+from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.sequences import find_sequences
+
+_LEAST_OF_SINE, _MOST_OF_TANGENT, _USUAL_OF_TANGENT = 0.95, 1.5, 1.15  # factors of the limits; see the header
+_WIDEST_DEG, _FINEST_PX = 150.0, 412_530.0  # degrees; focal length in pixels where one is 0.5 seconds of arc
+_REACHED = 0.95  # share of the observations of a lens; those farther out are few, or false
+_ASKED = 0.7  # share of the shorter side up to which fisheyes are asked; their pictures may end there
+# Shares of the way to the edge where a lens is asked; at the first, there is no distortion yet.
+_ALONG = np.array([0.02, 0.2, 0.4, 0.6, 0.8, 1.0])
+# Ways to the edges and corners; distortion is largest along the diagonals.
+_AROUND = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]], dtype=np.float64)
+
+
+class LensShape(NamedTuple):
+    """What a lens does to the picture."""
+
+    focal_widths: float
+    """Focal length over the longer side of the picture."""
+    view_deg: float
+    """Angle of view along the longer side; NaN where its edges have no ray."""
+    folds: bool
+    """Whether its distortion turns back within the circle that touches the nearer edges."""
+    of_sine: float
+    """Least rho / sin theta in the picture; see the module's header."""
+    of_tangent: tuple[float, float]
+    """Least and largest rho / tan theta in the picture."""
+    off_px: tuple[float, float]
+    """Pixels by which rho is short of sin theta, and exceeds tan theta, where points end; else infinite."""
+
+    def fault(self, lens: Lens, is_bogus: bool) -> tuple[str, bool]:
+        """Return what is wrong about the lens, and whether it cannot be; "" if nothing is."""
+        (least, longer), (is_short, is_long) = self.of_tangent, (off > FITTING_PX for off in self.off_px)
+        cx, cy = lens.row()[2:4].tolist()
+        is_outside = not (0.0 <= cx <= lens.width and 0.0 <= cy <= lens.height)
+        faults = {
+            "pixels finer than the air lets any camera see": (lens.focal_px > _FINEST_PX, True),
+            f"a straight picture {self.view_deg:.0f} degrees wide, which no lens makes": (
+                self.view_deg >= _WIDEST_DEG and least > HALF,
+                True,
+            ),
+            "a distortion that turns back inside the picture": (self.folds, True),
+            "a distortion that draws the edges in more than any fisheye does": (
+                self.of_sine < _LEAST_OF_SINE and is_short,
+                True,
+            ),
+            "a distortion that draws the corners out as no lens does": (
+                longer > _MOST_OF_TANGENT and is_long,
+                True,
+            ),
+            "a distortion that draws the corners out as hardly any lens does": (
+                longer > _USUAL_OF_TANGENT and is_long,
+                False,
+            ),
+            "a principal point outside the picture": (is_outside, False),
+            "parameters for which COLMAP's mapper drops images": (
+                is_bogus and abs(longer - 1.0) > FEW and is_long,
+                False,
+            ),
+        }
+        return next(((what, cannot_be) for what, (is_so, cannot_be) in faults.items() if is_so), ("", False))
+
+
+def measure_lens(lens: Lens, reach_px: float = np.nan) -> LensShape:
+    """Return what a lens does to its picture; the model is one that can be adjusted.
+
+    Its points end `reach_px` from the principal point; NaN if there are none.
+    """
+    focal, principal = lens.row()[:2], _middle(lens)
+    ends = _AROUND[:4] * _ASKED * 0.5 * min(lens.width, lens.height)
+    if lens.is_plane:
+        ends = np.where(_AROUND > 0.0, [lens.width, lens.height] - principal, principal) * _AROUND
+    ways = np.concatenate([(ends[:, None] * _ALONG[:, None]).reshape(-1, 2), reach_px * _AROUND[:4]])
+    rays = lens.rays(lens.row()[2:4] + ways)
+    theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    rho, asked = np.hypot(*(ways / focal).T), ends.shape[0] * len(_ALONG)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rho = rho * np.median(np.tan(theta[: asked : len(_ALONG)]) / rho[: asked : len(_ALONG)])
+        straight = np.where(theta < 0.5 * np.pi, np.tan(theta), np.inf)
+        bent = np.sin(np.minimum(theta, 0.5 * np.pi))
+        along = np.diff(theta[:asked].reshape(len(ends), -1), axis=1)
+        inside = np.hypot(*ways[:asked].T).reshape(len(ends), -1)[:, 1:] <= 0.5 * min(lens.width, lens.height)
+        edges = theta[:asked].reshape(len(ends), -1)[:4, -1]
+        wider = edges[:2] if lens.width >= lens.height else edges[2:]
+        short, long, stretch = bent - rho, rho - straight, rho[:asked] / straight[:asked]
+    off = np.stack([short[asked:], long[asked:]]) * focal.mean()
+    return LensShape(
+        focal_widths=lens.focal_px / max(lens.width, lens.height),
+        view_deg=float(np.degrees(wider.sum())) if lens.is_plane else np.nan,
+        folds=bool((~(along > 0.0) & inside).any()),
+        of_sine=float(np.nanmin(rho[:asked] / bent[:asked], initial=1.0)),
+        of_tangent=(float(np.nanmin(stretch, initial=1.0)), float(np.nanmax(stretch, initial=0.0))),
+        off_px=tuple(np.nan_to_num(off, nan=np.inf).max(axis=1).tolist()),
+    )
+
+
+def _middle(lens: Lens) -> FloatArray:
+    """Return the principal point (2,) in pixels, or the center of the picture if it is not inside."""
+    size, principal = np.array([lens.width, lens.height], dtype=np.float64), lens.row()[2:4]
+    return principal if ((principal >= 0.0) & (principal <= size)).all() else 0.5 * size
+
+
+def find_odd_lenses(images: Images, points: Points, pictures: Pictures, bogus: BoolArray) -> Iterator[Oddity]:
+    """Yield the posed images whose lenses cannot be, or hardly, together by what is wrong about them.
+
+    Args:
+        images, points, pictures: of one model; images without a pose do not count.
+        bogus: (l,) lenses for which COLMAP's mapper drops images (`Camera.has_bogus_params`).
+    """
+    posed = np.flatnonzero(images.is_posed)
+    widths, faults = np.full(len(images.lenses), np.nan), dict[tuple[str, bool], list[int]]()
+    reach_px = _reaches(images, points, pictures)
+    for k in np.unique(images.lens_of[posed]).tolist():
+        lens = images.lenses[k]
+        if lens.is_adjustable and min(lens.width, lens.height) > 0:
+            shape = measure_lens(lens, float(reach_px[k]))
+            widths[k] = shape.focal_widths
+            faults.setdefault(shape.fault(lens, bool(bogus[k])), []).append(k)
+    faults.pop(("", False), None)
+    for (fault, cannot_be), lenses in faults.items():
+        cameras = posed[np.isin(images.lens_of[posed], lenses)]
+        kind = "a lens that cannot be" if cannot_be else "an unusual lens"
+        sentence = f"{kind}: focal length {{}} picture widths, with {fault}"
+        yield Oddity(Kind.LENS, cannot_be, cameras, widths[images.lens_of[cameras]], sentence)
+    for rows, _ in find_sequences([images.names[k] for k in posed.tolist()]):
+        cameras = posed[rows]
+        own = widths[images.lens_of[cameras]]
+        if len(np.unique(images.lens_of[cameras])) >= SMALLEST_SHAPE and np.isfinite(own).all():
+            logs = np.log([own, images.focal_lengths_px[cameras]])
+            logs = np.abs(logs - np.median(logs, axis=1, keepdims=True))
+            if SIGMA_PER_MEDIAN * np.median(logs, axis=1).min() > FEW:
+                far, usual = logs.min(axis=0) > FEW, np.median(own)
+                sentence = "a lens unlike others of one device, as names say: focal length {} picture widths"
+                sentence = f"{sentence}, where {usual:.3g} is usual"
+                yield Oddity(Kind.LENS, False, cameras[far], own[far], sentence)
+
+
+def _reaches(images: Images, points: Points, pictures: Pictures) -> FloatArray:
+    """Return how far from the principal point of each lens its points reach, (l,) in pixels, or NaN."""
+    far: list[list[FloatArray]] = [[np.zeros(0)] for _ in images.lenses]
+    for k, rows in enumerate(points.rows_of_images(images.num_images)):
+        lens = images.lenses[images.lens_of[k]]
+        if len(rows) and lens.is_adjustable:
+            away = pictures.pixels(k, points.keypoints[rows]) - _middle(lens)
+            far[images.lens_of[k]].append(np.hypot(*away.T))
+    return np.array(
+        [np.quantile(each, _REACHED) if len(each) else np.nan for each in map(np.concatenate, far)]
+    )
