@@ -384,7 +384,7 @@ class CheckedFacts(FactsOfModel):
         if is_sound and self.num_points:  # poses alone, as of a list, are to be placed with points
             step = next_of_model(self.verdict.grade, self)
             return step._replace(command=step.command.format(out=path, out_dense="dense"))
-        if second is not None and second.wrong:
+        if second is not None and second.wrong and self.inputs.database:
             command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
             return NextStep("Next: take the model that map makes of the database; pairs support it.", command)
         if not (self.inputs.database and self.num_pairs) or self.verdict.doubts_database:

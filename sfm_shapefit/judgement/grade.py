@@ -53,6 +53,7 @@ from sfm_shapefit.scene.images import Images
 
 MOST_LEVEL_DEG = SURE_SIGMAS * KNOWN_DEG  # degrees, level of agreeing residuals; see the header
 IS_ITS_DATABASE = "is this the model's database?"  # ends a reason that doubts the matches, not the model
+ARE_ITS_PICTURES = "are these the model's pictures?"
 FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to be looked at
 
 

@@ -34,7 +34,7 @@ from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
-from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, Grade, ModelVerdict, weigh_evidence
+from sfm_shapefit.judgement.grade import ARE_ITS_PICTURES, IS_ITS_DATABASE, Grade, ModelVerdict, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models
@@ -45,6 +45,7 @@ from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
+from sfm_shapefit.pipeline.pictures import triangulate_matches
 from sfm_shapefit.scene.images import Images
 
 if TYPE_CHECKING:
@@ -112,6 +113,8 @@ def check_source(
     fits = None
     with clock("directions"), suppress(UnsolvableError):  # no pair may share matches
         fits = fit_pairs(model.images.centers, measure(matches, options, clock).directions)
+        if matches.inputs.is_made and not structure.points.num_points:
+            structure = triangulate_matches(matches, fits)
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     with clock("evidence"):
         evidence = gather_evidence(matches, fits, structure, clock.threads)
@@ -119,7 +122,7 @@ def check_source(
         second = None if fits is None or other is None else _compare(matches, fits, structure, other)
         if fits is not None and second is not None:
             evidence = evidence.beside(second, fits.sides[1])
-    verdict = _grade(model, cameras, fits, evidence, len(matches.matches.missing_names))
+    verdict = _grade(model, structure, matches, cameras, fits, evidence)
     recognized = recognize_resolution(*structure[:3])
     if verdict.is_bad and recognized is None:
         recognized = ask_convention(matches, clock.threads)
@@ -209,24 +212,24 @@ def _weaknesses(images: Images, quality: ImageQuality) -> Iterator[list[str]]:
 
 def _grade(
     model: ColmapModel,
+    structure: Structure,
+    matches: MatchSource,
     cameras: list[CameraRow],
     fits: PairFits | None,
     evidence: ModelEvidence,
-    num_missing: int,
 ) -> ModelVerdict:
-    """Return the verdict on a model; a weak camera that stands where another model has it is right.
-
-    Its database lacks `num_missing` images.
-    """
-    against = weigh_evidence(evidence, model.images)
+    """Return the verdict on a model; a weak camera that stands where another model has it is right."""
+    images, num_missing = model.images, len(matches.matches.missing_names)
+    against = weigh_evidence(evidence, images)
     confirmed = [] if evidence.second is None else evidence.second.confirmed.tolist()
-    right = {model.images.names[k] for k in confirmed}
+    right = {images.names[k] for k in confirmed}
     weak = (row.name for row in cameras if row.placed and row.reason and row.name not in right)
     named = tuple(dict.fromkeys([*against.cameras, *weak]))
-    if bad := (*_reasons_against(model.images, fits),) or against.reasons or (*_strange_pairs(fits),):
+    whose = ARE_ITS_PICTURES if matches.inputs.is_made else IS_ITS_DATABASE
+    if bad := (*_reasons_against(images, fits),) or against.reasons or (*_strange_pairs(fits, whose),):
         return ModelVerdict(grade=Grade.DO_NOT_USE, cameras=named, reasons=bad)
-    pointless = model.reconstruction.num_points3D() == 0
-    reasons = ("it has no 3D points, so that only matches say where its cameras stand",) if pointless else ()
+    no_points = not (model.reconstruction.num_points3D() or structure.points.num_points)
+    reasons = ("it has no 3D points, so that only matches say where its cameras stand",) if no_points else ()
     if num_missing:
         reasons = (*reasons, f"the database lacks {counted(num_missing, 'image')}: {IS_ITS_DATABASE}")
     reasons = (*reasons, *against.suspicions)
@@ -241,11 +244,11 @@ def _reasons_against(images: Images, fits: PairFits | None) -> Iterator[str]:
         yield "no two of its images have matches that say how they stand to each other"
 
 
-def _strange_pairs(fits: PairFits | None) -> Iterator[str]:
+def _strange_pairs(fits: PairFits | None, whose: str) -> Iterator[str]:
     """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
     if fits is not None and fits.contradicts.any() and not fits.agrees.any():
         against = counted(int(fits.contradicts.sum()), "pair")
-        yield f"{against} contradict it and none agrees: {IS_ITS_DATABASE}"
+        yield f"{against} contradict it and none agrees: {whose}"
 
 
 def _tell(
