@@ -4,8 +4,8 @@
     shared      those that see most points of the model together
     unshared    near in pose, but without common points: near duplicates must see the same
     alike       pictures that look alike, wherever their cameras stand: a fold has put them apart
-    seams       nearest and most alike across the weakest links of the model: the longest edges of the tree that
-                common points, else poses, span between the cameras
+    seams       nearest and most alike across the weakest links of the model: the longest edges of the
+                shortest tree between the cameras, by common points, else by poses
 
 Poses are compared by positions over the usual distance of neighbors, and by viewing directions over their
 usual angle. Pictures are compared by their descriptors, added up as differences from the nearest of some that
@@ -143,11 +143,11 @@ def _nearest(centers: FloatArray, axes: FloatArray) -> _Ranked:
     from scipy.spatial import KDTree
 
     count = min(_NEAR, len(centers) - 1)
-    distances, others = KDTree(centers).query(centers, count + 1)
+    distances, others = map(np.asarray, KDTree(centers).query(centers, count + 1))
     usual = float(np.median(distances[:, 1:])) or 1.0
     turns = np.linalg.norm(axes[others[:, 1:]] - axes[:, None], axis=2)  # chords of angles
     places = np.hstack([centers / usual, axes / (float(np.median(turns)) or 1.0)])
-    costs, others = KDTree(places).query(places, count + 1)
+    costs, others = map(np.asarray, KDTree(places).query(places, count + 1))
     own = others == np.arange(len(others))[:, None]  # one of two at the same place may come second
     own[~own.any(axis=1), -1] = True
     return _Ranked(others[~own].reshape(-1, count), costs[~own].reshape(-1, count))

@@ -42,8 +42,8 @@ def check(
             agree with it more easily.
         images: folder of the model's pictures, from which features and matches of chosen pairs are made if
             there is no database.
-        max_minutes: minutes after which no more of these are asked, so that the answer depends on the speed of
-            the computer; 0: none is asked, and None: all are.
+        max_minutes: minutes after which no more of these are matched, so that the answer depends on the
+            speed of the computer; 0: none is matched, and None: all are.
         second_opinion: whether `map_database` places the images of the database anew, to compare with; or
             what it made of that database already. Without a database or pictures there is none.
         progress: called as stages advance.
@@ -61,9 +61,7 @@ def check(
     other = None
     with ExitStack() as stack:
         if asked is not None:
-            inputs = replace(
-                stack.enter_context(match_pictures(posed, asked, clock)), folder=inputs.folder
-            )
+            inputs = replace(stack.enter_context(match_pictures(posed, asked, clock)), folder=inputs.folder)
         source = stack.enter_context(open_source(posed, inputs))
         if second_opinion and isinstance(source.matches, DatabaseMatches):
             file = source.matches.file

@@ -34,7 +34,13 @@ from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
-from sfm_shapefit.judgement.grade import ARE_ITS_PICTURES, IS_ITS_DATABASE, Grade, ModelVerdict, weigh_evidence
+from sfm_shapefit.judgement.grade import (
+    ARE_ITS_PICTURES,
+    IS_ITS_DATABASE,
+    Grade,
+    ModelVerdict,
+    weigh_evidence,
+)
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models

@@ -81,8 +81,8 @@ def _refuse_no_pictures(folder: Path, names: Sequence[str], states: Sequence[str
         return
     whys = ", ".join(f"{num:,} {why}" for why, num in Counter(states).items() if why != "asked")
     raise InputError(
-        f"{folder} has no two pictures of this model ({whys}); give the folder in which the names of its images "
-        f"begin, such as {names[0]}"
+        f"{folder} has no two pictures of this model ({whys}); give the folder in which the names "
+        f"of its images begin, such as {names[0]}"
     )
 
 

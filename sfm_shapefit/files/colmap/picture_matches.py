@@ -1,4 +1,4 @@
-"""Features of a model's pictures, and matches of chosen pairs, by pycolmap on the CPU, in a database of our own.
+"""Features of a model's pictures and matches of chosen pairs, by pycolmap on the CPU, in a database.
 
 Pictures are found under the names that the model has for them, else under the last part of these where only
 one file has it. They are read as COLMAP reads them, no larger than 1,600 pixels. Keypoints are stored in
@@ -8,10 +8,10 @@ count as calibrated. Ids are those of the model, so that the order in which thre
 
 import copy
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pycolmap
@@ -85,7 +85,7 @@ class PictureMatches:
                 database.write_frame(model.frame(frame_id), use_frame_id=True)
 
     def _detect_some(
-        self, database: pycolmap.Database, folder: Path, files: dict[int, bytes]
+        self, database: pycolmap.Database, folder: Path, files: Mapping[int, Any]
     ) -> Iterator[State]:
         """Write features of some pictures, and yield what became of each."""
         scratch = self.database.with_name("some.db")
@@ -118,13 +118,14 @@ class PictureMatches:
                 yield "asked"
 
     def descriptors(self, most: int) -> list[IntArray]:
-        """Return the SIFT descriptors (k, 128) of each image, the first of the list, which are the largest."""
+        """Return the SIFT descriptors (k, 128) of each image, those of its largest features."""
         with quiet_log(), pycolmap.Database.open(self.database) as database:
-            found = (
-                database.read_descriptors(i).data[:most] if database.exists_descriptors(i) else []
+            return [
+                database.read_descriptors(i).data[:most].astype(np.int64)
+                if database.exists_descriptors(i)
+                else np.zeros((0, 128), dtype=np.int64)
                 for i in self.model.images.ids.tolist()
-            )
-            return [np.asarray(some, dtype=np.int64).reshape(-1, 128) for some in found]
+            ]
 
     def match(self, pairs: IntArray, is_over: IsOver, advance: Advance) -> int:
         """Match pairs (k, 2) of images, verify them by the model's lenses, and return how many were asked."""
@@ -150,12 +151,12 @@ class PictureMatches:
         with quiet_log(), pycolmap.Database.open(self.database) as database:
             for image_id, name in zip(self.model.images.ids.tolist(), self.model.images.names, strict=True):
                 image = database.read_image(image_id)
-                image.name = bytes_of_name(name)
+                setattr(image, "name", bytes_of_name(name))
                 database.update_image(image)
 
 
 def find_pictures(folder: Path, names: tuple[str, ...]) -> list[Path | None]:
-    """Return the file of each image, relative to the folder; None where there is none, or another image has it."""
+    """Return the file of each image, relative to the folder; None without one, or if others have it too."""
     root = folder.resolve()
     found = [file_of(folder, name) for name in names]
     by_name: dict[str, list[Path]] = {}
