@@ -119,7 +119,7 @@ def check_source(
     fits = None
     with clock("directions"), suppress(UnsolvableError):  # no pair may share matches
         fits = fit_pairs(model.images.centers, measure(matches, options, clock).directions)
-        if matches.inputs.is_made and not structure.points.num_points:
+        if matches.inputs.is_made:
             structure = triangulate_matches(matches, fits)
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     with clock("evidence"):

@@ -151,7 +151,7 @@ class PictureMatches:
         with quiet_log(), pycolmap.Database.open(self.database) as database:
             for image_id, name in zip(self.model.images.ids.tolist(), self.model.images.names, strict=True):
                 image = database.read_image(image_id)
-                setattr(image, "name", bytes_of_name(name))
+                image.name = bytes_of_name(name)  # type: ignore[assignment]
                 database.update_image(image)
 
 
