@@ -97,12 +97,12 @@ def _lists(near: _Ranked, shared: Shared, alike: _Ranked) -> Iterator[tuple[str,
     most = np.concatenate([shared.pairs, shared.pairs[:, ::-1]])
     most = most[np.lexsort((most[:, 1], -np.tile(shared.counts, 2), most[:, 0]))]
     common = set(map(tuple, most.tolist()))
-    apart = [[pair not in common for pair in map(tuple, ranked.pairs().tolist())] for ranked in (near, alike)]
+    apart = np.array([pair not in common for pair in map(tuple, near.pairs().tolist())], dtype=np.bool_)
     yield "seams", *_across_seams(near, shared, alike)
     yield "neighbors", *_first(near.pairs(), _NEIGHBORS, count)
     yield "shared", *_first(most, _SHARED, count)
-    yield "unshared", *_first(near.pairs()[np.array(apart[0], dtype=np.bool_)], _UNSHARED, count)
-    yield "alike", *_first(alike.pairs()[np.array(apart[1], dtype=np.bool_)], _ALIKE, count)
+    yield "unshared", *_first(near.pairs()[apart], _UNSHARED, count)
+    yield "alike", *_first(alike.pairs(), _ALIKE, count)
 
 
 def _first(pairs: IntArray, most: int, count: int) -> tuple[IntArray, IntArray]:

@@ -232,7 +232,11 @@ def _grade(
     weak = (row.name for row in cameras if row.placed and row.reason and row.name not in right)
     named = tuple(dict.fromkeys([*against.cameras, *weak]))
     whose = ARE_ITS_PICTURES if matches.inputs.is_made else IS_ITS_DATABASE
-    if bad := (*_reasons_against(images, fits),) or against.reasons or (*_strange_pairs(fits, whose),):
+    if (
+        bad := (*_reasons_against(images, fits),)
+        or against.reasons
+        or (*_strange_pairs(images, fits, whose),)
+    ):
         return ModelVerdict(grade=Grade.DO_NOT_USE, cameras=named, reasons=bad)
     no_points = not (model.reconstruction.num_points3D() or structure.points.num_points)
     reasons = ("it has no 3D points, so that only matches say where its cameras stand",) if no_points else ()
@@ -250,11 +254,19 @@ def _reasons_against(images: Images, fits: PairFits | None) -> Iterator[str]:
         yield "no two of its images have matches that say how they stand to each other"
 
 
-def _strange_pairs(fits: PairFits | None, whose: str) -> Iterator[str]:
-    """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
-    if fits is not None and fits.contradicts.any() and not fits.agrees.any():
-        against = counted(int(fits.contradicts.sum()), "pair")
-        yield f"{against} contradict it and none agrees: {whose}"
+def _strange_pairs(images: Images, fits: PairFits | None, whose: str) -> Iterator[str]:
+    """Yield that pairs contradict, and none agrees, or too few to check one another.
+
+    A model's own points tie it whatever its database is. Of noise, each pair is one more false pose: as many
+    agree as join the cameras, and most others contradict.
+    """
+    if fits is None:
+        return
+    against, agreeing = (int(side.sum()) for side in (fits.contradicts, fits.agrees))
+    if against and not agreeing:
+        yield f"{counted(against, 'pair')} contradict it and none agrees: {whose}"
+    elif against > agreeing and agreeing < len(np.unique(images.frame_of[images.is_posed])):
+        yield f"{counted(against, 'pair')} contradict it, and no more than {agreeing} agree, which none checks"
 
 
 def _tell(
