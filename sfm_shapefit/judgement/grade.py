@@ -153,8 +153,9 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
         (reasons if len(set(apart) - confirmed) > FEW * count else suspicions).append(clause)
     if len(loose) < len(evidence.untied):
         suspicions.append("nothing checks how groups of cameras stand to one another")
-    if evidence.num_held is not None and evidence.num_held < HALF * count:
-        reasons.append(f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}")
+    held = evidence.num_held
+    if held is not None and (held < HALF * count or held < SMALLEST_PIECE <= count):  # any pair holds two
+        reasons.append(f"the pairs that agree hold only {held} of {counted(count, 'camera')}")
     if len(named.keys() - confirmed) > MANY * count and len(named) > len(apart):
         reasons.append(f"evidence speaks against {len(named)} of {counted(count, 'camera')}")
     if second is not None and second.has_nothing_in_common:

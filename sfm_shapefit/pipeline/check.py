@@ -51,6 +51,8 @@ def check(
     Raises:
         InputError: if the model or the database cannot be used.
     """
+    if max_minutes is not None and not max_minutes >= 0.0:
+        raise InputError(f"max_minutes must be >= 0, got {max_minutes}")
     clock = Clock.of(progress, SolverOptions())
     with clock("read"):
         inputs = choose_inputs(model, database)

@@ -266,7 +266,7 @@ def _strange_pairs(images: Images, fits: PairFits | None, whose: str) -> Iterato
     if against and not agreeing:
         yield f"{counted(against, 'pair')} contradict it and none agrees: {whose}"
     elif against > agreeing and agreeing < len(np.unique(images.frame_of[images.is_posed])):
-        yield f"{counted(against, 'pair')} contradict it, and no more than {agreeing} agree, which none checks"
+        yield f"{counted(against, 'pair')} contradict it, and only {agreeing} agree, too few to check it"
 
 
 def _tell(
