@@ -23,16 +23,16 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.scene.images import Images
 
 NUM_DESCRIBED = 400
-"""Descriptors of a picture that describe it."""
-_NEIGHBORS, _SHARED, _UNSHARED, _ALIKE = 6, 3, 3, 4  # pairs of each image by each reason
-_NEAR, _LOOKED_AT = 12, 20  # images near in pose, and alike ones, among which those are
-_ACROSS = 5  # pairs across a seam, of each kind
-_IMAGES_A_SEAM = 10  # images for each seam that is asked
+"""Descriptors of a picture that describe it; a tenth of those it has, so that comparing costs little."""
+_NEIGHBORS, _SHARED, _UNSHARED, _ALIKE = 6, 3, 3, 4  # pairs of an image by reason; 16 fit into 5 min of 100
+_NEAR, _LOOKED_AT = 12, 20  # images near in pose, and alike ones, that are looked at; more are never chosen
+_ACROSS = 5  # pairs across a seam, of each kind; three must agree on a turn
+_IMAGES_A_SEAM = 10  # images for each seam that is asked; a tenth of all in a part of its own is too many
 _FEWEST_SHARED = 15  # points; images with fewer share none, as COLMAP's least matches of a pair have it
 _WORDS = 32  # descriptors that pictures are compared by; more tell hardly more of a hundred pictures
 _STEPS, _MOST_STEPS = 512.0, 31.0  # a signature's numbers in steps of 1 / 512; products of those sum exactly
-_ROWS = 1000  # images that are compared with all at once
-_SEED = 0
+_ROWS = 1000  # images that are compared with all at once; of 10,000 that takes 40 MB
+_SEED = 0  # seed of the words; any will do, if it is always the same
 
 
 class ChosenPairs(NamedTuple):
@@ -41,7 +41,7 @@ class ChosenPairs(NamedTuple):
     pairs: IntArray
     """(k, 2) rows of images, i < j."""
     reasons: tuple[str, ...]
-    """Of each pair, the first of the list above."""
+    """(k) why each pair is asked, the first reason of the list above."""
 
 
 class Shared(NamedTuple):
@@ -78,7 +78,7 @@ def choose_pairs(images: Images, shared: Shared, descriptors: Sequence[IntArray]
 
 
 class _Ranked(NamedTuple):
-    """Of each of n images the others in some order, the first ones."""
+    """The others that come first by some cost, for each of n images."""
 
     others: IntArray
     """(n, k)"""

@@ -51,7 +51,7 @@ from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
-from sfm_shapefit.pipeline.pictures import triangulate_matches
+from sfm_shapefit.pipeline.pictures import points_of_pictures
 from sfm_shapefit.scene.images import Images
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def check_source(
     with clock("directions"), suppress(UnsolvableError):  # no pair may share matches
         fits = fit_pairs(model.images.centers, measure(matches, options, clock).directions)
         if matches.inputs.is_made:
-            structure = triangulate_matches(matches, fits)
+            structure = points_of_pictures(matches, fits)
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     with clock("evidence"):
         evidence = gather_evidence(matches, fits, structure, clock.threads)
@@ -257,8 +257,8 @@ def _reasons_against(images: Images, fits: PairFits | None) -> Iterator[str]:
 def _strange_pairs(images: Images, fits: PairFits | None, whose: str) -> Iterator[str]:
     """Yield that pairs contradict, and none agrees, or too few to check one another.
 
-    A model's own points tie it whatever its database is. Of noise, each pair is one more false pose: as many
-    agree as join the cameras, and most others contradict.
+    A model's own points tie it whatever its database is. Where matches are noise, each pair is one more false
+    pose: as many agree as join the cameras, and most others contradict.
     """
     if fits is None:
         return

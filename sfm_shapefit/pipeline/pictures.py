@@ -33,9 +33,7 @@ from sfm_shapefit.scene.matches import is_among
 from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.options import StructureOptions
 
-_OF_FEATURES = (
-    0.6  # share of the time that may be taken for the features; a pair is cheaper, but there are more
-)
+_FOR_FEATURES = 0.6  # share of the minutes; features take half of the time where there is no limit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +58,7 @@ def match_pictures(model: ColmapModel, asked: AskedPictures, clock: Clock) -> It
         pictures = PictureMatches(model=model, database=path, threads=clock.threads)
         with clock("features"):
             states = pictures.detect(
-                asked.folder, lambda: time.monotonic() > began + 60.0 * _OF_FEATURES * minutes, clock.advance
+                asked.folder, lambda: time.monotonic() > began + 60.0 * _FOR_FEATURES * minutes, clock.advance
             )
         _refuse_no_pictures(asked.folder, model.images.names, states)
         tracks = TrackMatches(model)
@@ -96,7 +94,7 @@ def _state(folder: Path, states: Sequence[str], reasons: Sequence[str], count: i
     return f"{counts['asked']:,} of {counted(len(states), 'picture')}{without} in {folder}, {asked}: {whys}"
 
 
-def triangulate_matches(source: MatchSource, fits: PairFits) -> Structure:
+def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:
     """Return the points that matches make where the cameras stand, but for those of contradicting pairs."""
     images, view = source.images, source.view
     pictures = ModelPictures(images, view.keypoints, view.num_keypoints)

@@ -28,12 +28,12 @@ _MOST_FEATURES = 4096  # keypoints of a picture, the largest ones; half of COLMA
 _PICTURES_AT_ONCE = 16  # pictures between two looks at the clock: about 10 s
 _PAIRS_AT_ONCE = 200  # pairs between two looks at the clock: about 10 s; the index of a picture serves many
 _SAME_SHAPE = 0.01  # relative difference of aspect ratios; pictures that are shrunk differ by less
-_SEED = 0  # of the samples that verify a pair
+_SEED = 0  # seed of the samples that verify a pair; any will do, if it is always the same
 
 IsOver = Callable[[], bool]
 """Whether the time that may be taken is over."""
 
-State = Literal["asked", "missing", "unreadable", "of another shape", "not asked"]
+PictureState = Literal["asked", "missing", "unreadable", "of another shape", "not asked"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,14 +46,14 @@ class PictureMatches:
     threads: int
     """Threads that detect and match."""
 
-    def detect(self, folder: Path, is_over: IsOver, advance: Advance) -> list[State]:
+    def detect(self, folder: Path, is_over: IsOver, advance: Advance) -> list[PictureState]:
         """Write features of the pictures, and return what became of each image.
 
         Pictures are read in an order that leaves those which the time allows spread over all.
         """
         names = self.model.images.names
         files = find_pictures(folder, names)
-        states: list[State] = ["missing" if file is None else "not asked" for file in files]
+        states: list[PictureState] = ["missing" if file is None else "not asked" for file in files]
         there = [k for k, file in enumerate(files) if file is not None]
         there = [there[k] for k in np.random.default_rng(_SEED).permutation(len(there)).tolist()]
         with quiet_log(), pycolmap.Database.open(self.database) as database:
@@ -86,7 +86,7 @@ class PictureMatches:
 
     def _detect_some(
         self, database: pycolmap.Database, folder: Path, files: Mapping[int, Any]
-    ) -> Iterator[State]:
+    ) -> Iterator[PictureState]:
         """Write features of some pictures, and yield what became of each."""
         scratch = self.database.with_name("some.db")
         scratch.unlink(missing_ok=True)
