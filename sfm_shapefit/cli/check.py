@@ -87,7 +87,8 @@ def check_command(
         known = choose_inputs(source, database).database
         if images is not None and report is None and known is not None:
             raise InputError(
-                f"the images are not asked, since the matches are those of {known}; leave them out"
+                f"the images are not asked, since the matches are those of {known}; "
+                "leave them out, or name a page for them with --report"
             )
         if max_minutes is not None and (images is None or known is not None):
             raise InputError(
