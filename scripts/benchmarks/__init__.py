@@ -15,7 +15,6 @@ INDEX = {
     "graphs": "Families of graphs against the oracle: expanders, areas, communities, long chains, streets.",
     "join": "Models cut into pieces and joined by a few of the pairs between: right, refused, wrong.",
     "map": "From a database to an adjusted model: map beside pycolmap's global and incremental mapping.",
-    "nonsense": "Databases of what belongs to no one model: false models called good, by every command.",
     "onedsfm": "The published 1DSfM scene Madrid Metropolis: seconds per stage, residuals of each objective.",
     "panoramas": "Native panoramas against a cubemap rig of one rendered yard, beside global mapping.",
     "peers": "pytheia, gtsam and pycolmap beside ours, on bare graphs and real scenes.",
