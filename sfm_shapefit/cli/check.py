@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     "check",
     cls=GroupedCommand,
     short_help="Judge any COLMAP model: can it be used, and which cameras are weak?",
-    epilog="Example: sfm-shapefit check sparse/0 --report check.html",
+    epilog="Example: sfm-shapefit check sparse/0 --images images --report check.html",
 )
 def check_command(
     model: ModelArgument = None,
@@ -51,6 +51,15 @@ def check_command(
         typer.Option("--report", metavar="FILE", help="Write a page that explains the verdict to FILE."),
     ] = None,
     images: ImageFolder = None,
+    max_minutes: Annotated[
+        float | None,
+        typer.Option(
+            "--max-minutes",
+            min=0.0,
+            metavar="NUMBER",
+            help="Minutes after which no more images are matched, 0 for none; else all chosen ones are.",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE, and OUT.")] = False,
     second_opinion: Annotated[
         Path | None,
@@ -70,7 +79,7 @@ def check_command(
     """Judge the poses of MODEL as they stand, whatever program made it; MODEL is not changed.
 
     A camera is weak if it sees few points, if its errors are large, or if many pairs
-    contradict it. Pairs come from the database, else from the model's tracks.
+    contradict it. Pairs come from the database, else from the images, else from the model's tracks.
     A folder of several models, as sparse with 0 and 1, gets one table, and which of them to keep.
     """
     source = one_path(model, input_path, "MODEL")
@@ -78,29 +87,40 @@ def check_command(
         from sfm_shapefit.files.model_folder import model_folders, refuse_no_model
 
         if len(model_folders(source)) > 1:
-            for flag, path in (("--report", report), ("--second-opinion", second_opinion)):
+            for flag, path in (
+                ("--report", report),
+                ("--second-opinion", second_opinion),
+                ("--images", images),
+            ):
                 if path is not None:
                     raise InputError(f"{flag} is of one model; give one of the folder's, or leave it out")
             is_usable = _check_pieces(source, database, not no_second_opinion, as_json=as_json, quiet=quiet)
             raise typer.Exit(EXIT_UNSOLVABLE if strict and not is_usable else 0)
         refuse_no_model(source)
         from sfm_shapefit.base.atomic_folder import claimed_output
-        from sfm_shapefit.files.colmap.database import find_database
         from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.check import check
+        from sfm_shapefit.pipeline.inputs import choose_inputs
         from sfm_shapefit.pipeline.write import refuse_file
 
         if second_opinion is not None and no_second_opinion:
             raise InputError("--second-opinion and --no-second-opinion contradict each other; give one")
-        near = database or find_database(source)
-        if second_opinion is not None and near is None:
+        known = choose_inputs(source, database).database
+        if second_opinion is not None and known is None:
             raise InputError("a second opinion needs the database of MODEL; name it with --database")
-        inputs = [path for path in (source, near, images) if path is not None]
-        if images is not None and report is None:
-            raise InputError("pictures of the images go into a page; name it with --report")
+        if images is not None and report is None and known is not None:
+            raise InputError(
+                f"the images are not asked, since the matches are those of {known}; "
+                "leave them out, or name a page for them with --report"
+            )
+        if max_minutes is not None and (images is None or known is not None):
+            raise InputError(
+                "--max-minutes is for images without a database; name their folder with --images"
+            )
+        inputs = [path for path in (source, known, images) if path is not None]
         if report is not None:  # now, not when all is computed
-            if report.exists() and not overwrite:
+            if report.exists() and not overwrite and (images is None or known is not None):
                 read_source(source, database)  # what is wrong with that is said first
             refuse_file(report, overwrite=overwrite, protect=inputs)
         with (
@@ -110,7 +130,14 @@ def check_command(
             show_progress(not (quiet or as_json)) as progress,
             hear_pycolmap(False),
         ):
-            found = check(source, database, second_opinion=not no_second_opinion, progress=progress)
+            found = check(
+                source,
+                database,
+                images=images,
+                max_minutes=max_minutes,
+                second_opinion=not no_second_opinion,
+                progress=progress,
+            )
             found = _keep_second(found, second_opinion, overwrite=overwrite)
         if report is not None:
             found.report(report, images=images or "", overwrite=overwrite)

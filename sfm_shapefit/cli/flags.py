@@ -64,7 +64,12 @@ Config = Annotated[Path | None, typer.Option("--config", help="Options from a TO
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 ImageFolder = Annotated[
     Path | None,
-    typer.Option("--images", "--image_path", metavar="FOLDER", help="Folder of the images, for the report."),
+    typer.Option(
+        "--images",
+        "--image_path",
+        metavar="FOLDER",
+        help="Folder of the images: matched where there is no database, and shown in FILE.",
+    ),
 ]
 
 _ALSO = {"quiet": "-q", "verbose": "-v", "images": "--image_path"}

@@ -389,6 +389,7 @@ class CheckedFacts(FactsOfModel):
         if (
             second is not None
             and not is_alike
+            and self.inputs.database
             and (second.wrong or second.grade.is_better_than(verdict.grade))
         ):
             return self._next_of_map(second)

@@ -107,13 +107,15 @@ class Inputs:
     """Pairs that are taken for unmatched."""
     is_found: bool = False
     """Whether the database was found beside the model, and nobody asked for it."""
+    is_made: bool = False
+    """Whether the database was made of the model's pictures, for this run alone."""
 
     @property
     def facts(self) -> ModelInputs:
         """What is told of them."""
         return ModelInputs(
             model=str(self.folder or IN_MEMORY),
-            database=None if self.database is None else str(self.database),
+            database=None if self.database is None or self.is_made else str(self.database),
             directions=self.statement,
         )
 

@@ -17,7 +17,17 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, extent_of, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
-from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, OUTNUMBERED, RARE, SIGMAS, SURE_SIGMAS
+from sfm_shapefit.judgement.limits import (
+    FEW,
+    FEWEST_ALIKE,
+    HALF,
+    KNOWN_DEG,
+    MANY,
+    OUTNUMBERED,
+    RARE,
+    SIGMAS,
+    SURE_SIGMAS,
+)
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
 from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.seams import Seam
@@ -96,7 +106,10 @@ class PairFits:
         return find_other_places(self.centers, pairs, directions, self.agrees[rows], self.level_deg)
 
     def contradicted(self, images: Images) -> tuple[Contradicted, ...]:
-        """Return the images whose frames are contradicted by more of their pairs than is usual."""
+        """Return the images whose frames are contradicted by more of their pairs than is usual.
+
+        A frame none of whose pairs has a direction is contradicted by three whose matches contradict it.
+        """
         ends = images.frame_of[self.directions.pairs]
         known = np.isfinite(self.residuals_deg) & (ends[:, 0] != ends[:, 1])
         count = len(images.frames.ids)
@@ -106,6 +119,10 @@ class PairFits:
         asked = total > 0
         usual = float(np.median(shares[asked])) if asked.any() else 0.0
         many = asked & (shares > max(MANY, OUTNUMBERED * usual))
+        lost = np.bincount(ends[self.contradicts & (ends[:, 0] != ends[:, 1])].ravel(), minlength=count)
+        for counts in (total, against):
+            counts[~asked] = lost[~asked]
+        many |= ~asked & (lost >= FEWEST_ALIKE)
         rows = np.flatnonzero(many[images.frame_of] & np.isfinite(self.centers).all(axis=1))
         of = images.frame_of.tolist()
         return tuple(Contradicted(k, int(total[of[k]]), int(against[of[k]])) for k in rows.tolist())

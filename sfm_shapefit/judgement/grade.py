@@ -91,8 +91,9 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
         clause = clause.format(f"{len(apart)} of {counted(count, 'camera')}")
         grade = Grade.DO_NOT_USE if len(set(apart) - confirmed) > FEW * count else Grade.LOOK
         yield of_model(Kind.APART, clause, grade, names(apart))
-    if evidence.num_held is not None and evidence.num_held < HALF * count:
-        clause = f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}"
+    held = evidence.num_held
+    if held is not None and (held < HALF * count or held < SMALLEST_PIECE <= count):  # any pair holds two
+        clause = f"the pairs that agree hold only {held} of {counted(count, 'camera')}"
         yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
     if len(named - confirmed) > MANY * count and len(named) > len(apart):
         clause = f"evidence speaks against {len(named)} of {counted(count, 'camera')}"

@@ -9,6 +9,7 @@ from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, counted_are, first_of
 
 IS_ITS_DATABASE = "is this the model's database?"  # ends a sentence that doubts the matches, not the model
+ARE_ITS_PICTURES = "are these the model's pictures?"  # likewise, of matches of its pictures
 
 
 class Grade(enum.StrEnum):

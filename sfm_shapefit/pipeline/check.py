@@ -1,5 +1,7 @@
 """`check MODEL`: the verdict on a COLMAP model as it stands, with a second opinion of our own."""
 
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +10,7 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.files.colmap.database import DatabaseMatches
-from sfm_shapefit.files.colmap.listed_poses import read_source
+from sfm_shapefit.files.colmap.listed_poses import read_by_itself, read_source
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.judgement.evidence import fit_pairs
@@ -17,6 +19,7 @@ from sfm_shapefit.pipeline.checked import CheckResult, OtherModel, check_source
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.map import map_opened
+from sfm_shapefit.pipeline.pictures import AskedPictures, match_pictures
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
 from sfm_shapefit.solver.options import SolverOptions
@@ -26,6 +29,8 @@ def check(
     model: ModelSource,
     database: Path | str | None = None,
     *,
+    images: Path | str | None = None,
+    max_minutes: float | None = None,
     second_opinion: bool | MapResult = True,
     progress: Progress | None = None,
 ) -> CheckResult:
@@ -35,20 +40,32 @@ def check(
         model: a reconstruction, a result, a model folder or a list of poses, as for `locate`.
         database: as for `locate`; without one, the pairs are those that share points of the model, which
             agree with it more easily.
+        images: folder of the model's pictures, from which features and matches of chosen pairs are made if
+            there is no database.
+        max_minutes: minutes after which no more of these are matched, so that the answer depends on the
+            speed of the computer; 0: none is matched, and None: all are.
         second_opinion: whether `map_database` places the images of the database anew, to compare with; or
             what it made of that database already. The result has it under the same name; None without a
-            database.
+            database or pictures.
         progress: called as stages advance.
 
     Raises:
         InputError: if the model or the database cannot be used.
     """
+    if max_minutes is not None and not max_minutes >= 0.0:
+        raise InputError(f"max_minutes must be >= 0, got {max_minutes}")
     clock = Clock.of(progress, SolverOptions())
     with clock("read"):
-        posed, _ = read_source(model, database)
         inputs = choose_inputs(model, database)
+        asked = None
+        if images is not None and inputs.database is None and max_minutes != 0.0:
+            asked = AskedPictures(folder=Path(images), max_minutes=max_minutes)
+        posed = read_by_itself(model, with_lenses=True) if asked else read_source(model, database)[0]
     other = None
-    with open_source(posed, inputs) as source:
+    with ExitStack() as stack:
+        if asked is not None:
+            inputs = replace(stack.enter_context(match_pictures(posed, asked, clock)), folder=inputs.folder)
+        source = stack.enter_context(open_source(posed, inputs))
         if second_opinion and isinstance(source.matches, DatabaseMatches):
             file = source.matches.file
             try:

@@ -40,6 +40,7 @@ from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpini
 from sfm_shapefit.judgement.grade import too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.reasons import (
+    ARE_ITS_PICTURES,
     IS_ITS_DATABASE,
     Grade,
     Kind,
@@ -57,6 +58,7 @@ from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, ask_shape, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
+from sfm_shapefit.pipeline.pictures import points_of_pictures
 from sfm_shapefit.scene.images import Images
 
 if TYPE_CHECKING:
@@ -135,6 +137,8 @@ def check_source(
     fits = None
     with clock("directions"), suppress(UnsolvableError):  # no pair may share matches
         fits = fit_pairs(model.images.centers, measure(matches, options, clock).directions)
+        if matches.inputs.is_made:
+            structure = points_of_pictures(matches, fits)
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     with clock("evidence"):
         evidence = gather_evidence(matches, fits, structure, clock.threads)
@@ -146,7 +150,7 @@ def check_source(
         second = None if fits is None or other is None else _compare(matches, fits, structure, other)
         if fits is not None and second is not None:
             evidence = evidence.beside(second, fits.sides[1])
-    reasons = list(_reasons(model, weak, fits, evidence, matches))
+    reasons = list(_reasons(model, structure, weak, fits, evidence, matches))
     verdict = ModelVerdict.weigh(reasons)
     recognized = recognize_resolution(*structure[:3])
     if verdict.is_bad and recognized is None:
@@ -242,13 +246,14 @@ def _find_weak(images: Images, quality: ImageQuality) -> Iterator[Reason]:
 
 def _reasons(
     model: ColmapModel,
+    structure: Structure,
     weak: list[Reason],
     fits: PairFits | None,
     evidence: ModelEvidence,
     matches: MatchSource,
 ) -> Iterator[Reason]:
     """Yield what speaks against a model; a weak camera that stands where another model has it is right."""
-    pointless = model.reconstruction.num_points3D() == 0
+    pointless = not (model.reconstruction.num_points3D() or structure.points.num_points)
     centers = model.images.centers
     if np.ptp(centers, axis=0).max() <= _ROUNDING * np.abs(centers).max():
         clause = "all its cameras stand at the same place; place them with sfm-shapefit locate"
@@ -263,7 +268,7 @@ def _reasons(
     against = list(weigh_evidence(evidence, model.images))
     yield from against
     if fits is not None and not any(one.grade is Grade.DO_NOT_USE for one in against):
-        yield from _strange_pairs(fits, has_database=matches.inputs.database is not None)
+        yield from _strange_pairs(model.images, fits, matches)
     confirmed = [] if evidence.second is None else evidence.second.confirmed.tolist()
     right = {model.images.names[k] for k in confirmed}
     yield from (one for one in weak if not right.issuperset(one.images))
@@ -275,13 +280,21 @@ def _reasons(
         yield of_model(Kind.INPUT, clause)
 
 
-def _strange_pairs(fits: PairFits, *, has_database: bool) -> Iterator[Reason]:
-    """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
-    if fits.contradicts.any() and not fits.agrees.any():
-        count = int(fits.contradicts.sum())
-        clause = f"{counted(count, 'pair')} contradict{'s' * (count == 1)} it and none agrees"
-        clause += f": {IS_ITS_DATABASE}" * has_database
-        yield of_model(Kind.INPUT, clause, Grade.DO_NOT_USE)
+def _strange_pairs(images: Images, fits: PairFits, matches: MatchSource) -> Iterator[Reason]:
+    """Yield that pairs contradict, and none agrees, or too few to check one another.
+
+    A model's own points tie it whatever its database is. Where matches are noise, each pair is one more false
+    pose: as many agree as join the cameras, and most others contradict.
+    """
+    against, agreeing = (int(side.sum()) for side in (fits.contradicts, fits.agrees))
+    pairs = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
+    if against and not agreeing:
+        whose = ARE_ITS_PICTURES if matches.inputs.is_made else IS_ITS_DATABASE
+        asked = f": {whose}" * (matches.inputs.database is not None)
+        yield of_model(Kind.INPUT, f"{pairs} and none agrees{asked}", Grade.DO_NOT_USE)
+    elif against > agreeing and agreeing < len(np.unique(images.frame_of[images.is_posed])):
+        clause = f"{pairs}, and only {agreeing} agree, too few to check it"
+        yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
 
 
 def _tell(

@@ -65,6 +65,7 @@ def gather_evidence(
     contradicted = fits.contradicted(images)
     doubted = np.isin(np.arange(images.num_images), [one.camera for one in contradicted])
     sure = ask_pixels(source, structure, doubted)
+    num_unasked = int(np.sum(source.view.num_keypoints == 0)) if source.inputs.is_made else 0
     return ModelEvidence(
         lenses=lenses,
         oddities=odd,
@@ -72,7 +73,7 @@ def gather_evidence(
         seams=seams,
         contradicted=tuple(one for one in contradicted if not sure[one.camera]),
         untied=tuple(one for one in untied if 2 * np.isin(one.cameras, apart).sum() < len(one.cameras)),
-        num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)),
+        num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)) + num_unasked,
     )
 
 

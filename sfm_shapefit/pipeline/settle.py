@@ -212,13 +212,20 @@ def finish_piece(
 
 
 def _start(stand: Stand, first: FirstPlacement | None) -> Stand:
-    """Return where the cameras stand with what an adjustment of a first placement knows of them."""
+    """Return where the cameras stand with what an adjustment of a first placement knows of them.
+
+    It knows nothing of a piece fewer than two of whose cameras had places then, or all of them the same.
+    """
     if first is None:
         return stand
     centers = first.near.locations[stand.placement.cameras]
-    there = np.isfinite(centers).all(axis=1)  # some may have had no place then
-    scale = median_spread(centers[there]) / median_spread(stand.placement.locations[there])
-    return stand._replace(estimate=first.adjusted, scale=scale)
+    there = np.isfinite(centers).all(axis=1)
+    if there.sum() < 2:
+        return stand
+    before, now = median_spread(centers[there]), median_spread(stand.placement.locations[there])
+    if not (before > 0.0 and now > 0.0):
+        return stand
+    return stand._replace(estimate=first.adjusted, scale=before / now)
 
 
 def _adjust(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:

@@ -17,7 +17,7 @@ from tests.program import run
 from tests.scenes import RING, ROOT, fingerprint
 
 SCRIPTS = ROOT / "scripts"
-PARTS = {"answer_cases", "answer_differences", "answer_inputs", "made_models"}
+PARTS = {"answer_cases", "answer_differences", "answer_inputs", "made_models", "nonsense"}
 """Modules that belong to another one."""
 SECTIONS = sorted(set(INDEX) - {"answers"})
 

@@ -1,0 +1,105 @@
+"""Matches for a model without a database: features of its pictures, and matches of chosen pairs of them.
+
+The matches are in a database of their own in a temporary folder, which is gone in the end; nothing is written
+to the folders of the user.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from sfm_shapefit.adjustment.sources import collect_matches
+from sfm_shapefit.adjustment.structure import triangulate
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.paths import refuse_no_folder
+from sfm_shapefit.base.wording import counted
+from sfm_shapefit.facts.result import Inputs
+from sfm_shapefit.files.colmap.model import ColmapModel
+from sfm_shapefit.files.colmap.picture_matches import PictureMatches
+from sfm_shapefit.files.colmap.points import ModelPictures
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
+from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, Shared, choose_pairs
+from sfm_shapefit.judgement.evidence import PairFits
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.evidence import Structure
+from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.scene.matches import is_among
+from sfm_shapefit.tracks.filter import filter_points
+from sfm_shapefit.tracks.options import StructureOptions
+
+_FOR_FEATURES = 0.6  # share of the minutes; features take half of the time where there is no limit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskedPictures:
+    """Pictures of a model, and the minutes that asking them may take."""
+
+    folder: Path
+    max_minutes: float | None = None
+
+
+@contextmanager
+def match_pictures(model: ColmapModel, asked: AskedPictures, clock: Clock) -> Iterator[Inputs]:
+    """Yield the inputs that a model's pictures make: a database, which is gone afterwards.
+
+    Raises:
+        InputError: if fewer than two pictures can be read.
+    """
+    refuse_no_folder(asked.folder)
+    began, minutes = time.monotonic(), np.inf if asked.max_minutes is None else asked.max_minutes
+    with TemporaryDirectory(prefix="shapefit-") as scratch:
+        path = Path(scratch) / "database.db"
+        pictures = PictureMatches(model=model, database=path, threads=clock.threads)
+        with clock("features"):
+            states = pictures.detect(
+                asked.folder, lambda: time.monotonic() > began + 60.0 * _FOR_FEATURES * minutes, clock.advance
+            )
+        _refuse_no_pictures(asked.folder, model.images.names, states)
+        tracks = TrackMatches(model)
+        shared = Shared(tracks.pairs, tracks.num_matches)
+        chosen = choose_pairs(model.images, shared, pictures.descriptors(NUM_DESCRIBED))
+        with clock("matches"):
+            count = pictures.match(
+                chosen.pairs, lambda: time.monotonic() > began + 60.0 * minutes, clock.advance
+            )
+        pictures.name_images()
+        statement = _state(asked.folder, states, chosen.reasons, count)
+        yield Inputs(folder=None, database=path, statement=statement, is_made=True)
+
+
+def _refuse_no_pictures(folder: Path, names: Sequence[str], states: Sequence[str]) -> None:
+    """Raise InputError if hardly a picture can be asked."""
+    if states.count("asked") >= 2:
+        return
+    whys = ", ".join(f"{num:,} {why}" for why, num in Counter(states).items() if why != "asked")
+    raise InputError(
+        f"{folder} has no two pictures of this model ({whys}); give the folder in which the names "
+        f"of its images begin, such as {names[0]}"
+    )
+
+
+def _state(folder: Path, states: Sequence[str], reasons: Sequence[str], count: int) -> str:
+    """Say what was asked, why, and what was not."""
+    counts = Counter(states)
+    others = [f"{num:,} {why}" for why, num in counts.items() if why != "asked"]
+    without = f" ({', '.join(others)})" if others else ""
+    whys = ", ".join(f"{num:,} {why}" for why, num in Counter(reasons[:count]).items())
+    asked = counted(count, "pair") if count == len(reasons) else f"{count:,} of {len(reasons):,} chosen pairs"
+    return f"{counts['asked']:,} of {counted(len(states), 'picture')}{without} in {folder}, {asked}: {whys}"
+
+
+def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:
+    """Return the points that matches make where the cameras stand, but for those of contradicting pairs."""
+    images, view = source.images, source.view
+    pictures = ModelPictures(images, view.keypoints, view.num_keypoints)
+    links = view.links(chosen=~is_among(view.pairs, fits.sides[1]))
+    matches = collect_matches(images, pictures, np.arange(images.num_images), links, view.num_matches)
+    options = StructureOptions()
+    points = triangulate(images, matches, options)
+    return Structure(filter_points(points, images, pictures, options), images, pictures)
