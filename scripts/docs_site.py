@@ -34,6 +34,7 @@ GROUPS = {
     ),
     "Understand": ("docs/report.md", "docs/glossary.md", "docs/method.md", "docs/formats.md", "docs/json.md"),
     "Python": ("docs/python.md", "docs/synthetic.md"),
+    "Contribute": ("CONTRIBUTING.md", "docs/architecture.md", "docs/guides.md"),
 }
 """Pages in the menu; the others of docs follow, then what is measured."""
 _LINK = re.compile(r'(href|src)="([^"]+)"')

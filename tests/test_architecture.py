@@ -2,32 +2,14 @@
 
 import ast
 from collections import Counter
-from functools import cache
-from pathlib import Path
 
 import pytest
 
+import architecture
+from harness.rooms import FLOORS, MODULES, PACKAGE, ROOMS, arrows, imports_of, room_of, tree_of
 from tests.base.test_jit import is_kernel
 from tests.program import run_python
 
-PACKAGE = Path(__file__).parents[1] / "sfm_shapefit"
-
-# Bottom first. A module imports from floors below its own and from its own room.
-FLOORS = [
-    {"base"},
-    {"scene", "laplacian"},
-    {"graph"},
-    {"solver", "files"},
-    {"pairs", "refinement"},
-    {"tracks", "rotations", "synthetic"},
-    {"adjustment"},
-    {"placement"},
-    {"judgement"},
-    {"facts"},
-    {"report"},
-    {"pipeline", "synthetic/fixtures"},
-    {"cli", "__main__"},
-]
 MOST_ARROWS = 75  # between rooms, beside those to base/; the list may only become shorter
 
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
@@ -56,8 +38,6 @@ MOST_LINES = {
 MOST_LINES_OF_A_PAGE = 150  # of the pipeline of a command, so that its stages are seen at one glance
 SLACK_LINES = 40  # a budget further above its room than this is to be lowered
 
-ROOMS = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
-
 DOORS = {
     "numba": {"base/jit.py", "base/kernel_cache.py", "base/kernel_code.py"},
     "cvxpy": {"solver/conic.py"},
@@ -79,50 +59,6 @@ DOORS = {
 
 MOST_PARAMETERS = 6
 
-MODULES = sorted(set(PACKAGE.rglob("*.py")) - {PACKAGE / "__init__.py"})  # which imports lazily, from all
-
-
-@cache
-def tree_of(path: Path) -> ast.Module:
-    """A module, parsed once."""
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-@cache
-def imports_of(path: Path, *, at_run_time: bool = False) -> frozenset[str]:
-    """Dotted names of all modules that a file imports, inside functions too."""
-    nodes, found = list(ast.walk(tree_of(path))), set()
-    checked = [
-        node for node in nodes if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-    ]
-    unseen = {inner for node in checked if at_run_time for part in node.body for inner in ast.walk(part)}
-    for node in nodes:
-        if node in unseen:
-            continue
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return frozenset(found)
-
-
-def room_of(path: Path) -> str:
-    """The folder of a module, or the module itself where it stands alone."""
-    inside = str(path.relative_to(PACKAGE)).removesuffix(".py")
-    return inside if inside in ROOMS else inside.split("/")[0]  # fixtures use what they are to test
-
-
-@cache
-def arrows() -> frozenset[tuple[str, str]]:
-    """Room and room that it imports from, of all modules."""
-    found = set()
-    for path in MODULES:
-        own = room_of(path)
-        names = (name.removeprefix("sfm_shapefit.") for name in imports_of(path) if "." in name)
-        used = {"/".join(name.split(".")[:k]) for name in names for k in (1, 2)} & set(ROOMS)
-        found |= {(own, room) for room in used - {own}}
-    return frozenset(found)
-
 
 def test_every_module_stands_in_a_room_of_a_floor():
     assert {room_of(path) for path in MODULES} == set(ROOMS)
@@ -132,6 +68,10 @@ def test_every_module_stands_in_a_room_of_a_floor():
 
 def test_a_module_imports_only_from_floors_below_its_own():
     assert {(own, room) for own, room in arrows() if ROOMS[room] >= ROOMS[own]} == {("__main__", "cli")}
+
+
+def test_the_picture_of_the_rooms_is_that_of_the_imports():
+    assert (PACKAGE.parent / "docs/architecture.svg").read_text(encoding="utf-8") == architecture.picture()
 
 
 def test_rooms_have_few_arrows():
