@@ -87,13 +87,7 @@ def check_command(
         from sfm_shapefit.files.model_folder import model_folders, refuse_no_model
 
         if len(model_folders(source)) > 1:
-            for flag, path in (
-                ("--report", report),
-                ("--second-opinion", second_opinion),
-                ("--images", images),
-            ):
-                if path is not None:
-                    raise InputError(f"{flag} is of one model; give one of the folder's, or leave it out")
+            _refuse_of_many({"--report": report, "--second-opinion": second_opinion, "--images": images})
             is_usable = _check_pieces(source, database, not no_second_opinion, as_json=as_json, quiet=quiet)
             raise typer.Exit(EXIT_UNSOLVABLE if strict and not is_usable else 0)
         refuse_no_model(source)
@@ -104,20 +98,10 @@ def check_command(
         from sfm_shapefit.pipeline.inputs import choose_inputs
         from sfm_shapefit.pipeline.write import refuse_file
 
+        known = choose_inputs(source, database).database
         if second_opinion is not None and no_second_opinion:
             raise InputError("--second-opinion and --no-second-opinion contradict each other; give one")
-        known = choose_inputs(source, database).database
-        if second_opinion is not None and known is None:
-            raise InputError("a second opinion needs the database of MODEL; name it with --database")
-        if images is not None and report is None and known is not None:
-            raise InputError(
-                f"the images are not asked, since the matches are those of {known}; "
-                "leave them out, or name a page for them with --report"
-            )
-        if max_minutes is not None and (images is None or known is not None):
-            raise InputError(
-                "--max-minutes is for images without a database; name their folder with --images"
-            )
+        _refuse_without_use(known, images, report, second_opinion, max_minutes)
         inputs = [path for path in (source, known, images) if path is not None]
         if report is not None:  # now, not when all is computed
             if report.exists() and not overwrite and (images is None or known is not None):
@@ -150,6 +134,32 @@ def check_command(
             print_ending(found.verdict.grade.value, found.verdict.statement, written, told.step.command)
         if strict and not found.verdict.is_usable:
             raise typer.Exit(EXIT_UNSOLVABLE)
+
+
+def _refuse_of_many(given: dict[str, Path | None]) -> None:
+    """Raise InputError for flags that are of one model, where a folder of several is judged."""
+    for flag, path in given.items():
+        if path is not None:
+            raise InputError(f"{flag} is of one model; give one of the folder's, or leave it out")
+
+
+def _refuse_without_use(
+    known: Path | None,
+    images: Path | None,
+    report: Path | None,
+    second_opinion: Path | None,
+    max_minutes: float | None,
+) -> None:
+    """Raise InputError for a flag that the matches of a `known` database, or their lack, make useless."""
+    if second_opinion is not None and known is None:
+        raise InputError("a second opinion needs the database of MODEL; name it with --database")
+    if images is not None and report is None and known is not None:
+        raise InputError(
+            f"the images are not asked, since the matches are those of {known}; "
+            "leave them out, or name a page for them with --report"
+        )
+    if max_minutes is not None and (images is None or known is not None):
+        raise InputError("--max-minutes is for images without a database; name their folder with --images")
 
 
 def _keep_second(found: "CheckResult", out: Path | None, *, overwrite: bool) -> "CheckResult":
