@@ -35,7 +35,7 @@ def judge_graph(placement: Judged) -> ModelVerdict:
     level, assessment, reasons = placement.assessment.level_deg, placement.assessment, list[Reason]()
     graph, agrees, count = placement.measured_part().graph, placement.agreement.agrees, len(placement.cameras)
     edges, shares = graph.edges[agrees], sigmas_of_extent(placement)
-    is_barely_held = barely_held(count, edges, graph.directions[agrees])
+    is_barely_held = barely_held(graph.num_nodes, edges, graph.directions[agrees])[:count]  # without points
     if level > _MOST_LEVEL_DEG:
         clause = f"the directions are {level:.0f} degrees off the cameras"
         reasons.append(of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE))
@@ -46,7 +46,8 @@ def judge_graph(placement: Judged) -> ModelVerdict:
     if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
         reasons.append(of_model(Kind.UNCHECKED, "no pair is checked by others", Grade.CANNOT_BE_JUDGED))
     names = [graph.name_of(k) for k in range(count)]
-    few_ties = _tell_few_ties(find_few_ties(count, edges), is_barely_held, shares, names)
+    ties = [] if graph.num_nodes > count else find_few_ties(count, edges)  # points tie cameras, too
+    few_ties = _tell_few_ties(ties, is_barely_held, shares, names)
     return judge_model(placement, Shares(), reasons, few_ties)
 
 

@@ -449,7 +449,8 @@ def _expect(expected: Any, own: Any, levels2: Any, weights: Any, found: Any) -> 
             terms[k] = peak * np.exp(-0.5 * exponent)
             total += terms[k]
         sums[0] += weights[0] / total
-        common, information[e] = 0.0, 0.0
+        common = 0.0
+        information[e] = 0.0
         for k in range(lowest, num_levels):
             share = terms[k] / total
             sums[k + 1] += share
@@ -458,7 +459,8 @@ def _expect(expected: Any, own: Any, levels2: Any, weights: Any, found: Any) -> 
                 for a in range(num_axes):
                     information[e, a] += share / (levels2[k] + own[e, a])
         if variance == 0.0:
-            information[e] = common
+            for a in range(num_axes):
+                information[e, a] = common
         likelihood[e] = np.log(total)
 
 

@@ -18,7 +18,7 @@ from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
-from sfm_shapefit.placement.second_configuration import SecondConfiguration
+from sfm_shapefit.placement.second_configuration import Found, SecondConfiguration
 
 PACKAGE = Path(sfm_shapefit.__file__).parent
 ADVICE = re.compile("trust it|without a look|do not use|can(not)? be used|is sound|is good", re.IGNORECASE)
@@ -53,8 +53,7 @@ def uncertain(found):
 
 
 def second_configuration(found):
-    cameras, far = np.array([1, 2]), SecondConfiguration
-    second = far(**{name: cameras if name == "cameras" else 9 for name in far.__dataclass_fields__})
+    second = SecondConfiguration(found=Found.BY_A_START, cameras=np.array([1, 2]), num_pairs=9, num_against=9)
     placement = replace(found.placement, second_configuration=second)
     return replace(found, placement=placement), quality_warnings(placement)
 
@@ -72,7 +71,7 @@ def unsupported(found):
 def twofold(found, status=DirectionStatus.TWO_MOTIONS):
     statuses = tuple(status if k % 3 else one for k, one in enumerate(found.directions.status))
     told = replace(found, directions=replace(found.directions, status=statuses))
-    return told, match_warnings(told.directions)
+    return told, match_warnings(told.directions, may_repeat=True)
 
 
 def contradicting_rotations(found):
