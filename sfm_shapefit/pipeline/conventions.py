@@ -25,7 +25,7 @@ _MOST_TURNED_DEG = 5.0  # degrees; other conventions are off by tens
 
 
 def ask_resolution(source: MatchSource) -> Recognized | None:
-    """Return in what resolution pixels are, of a database or else of points; None if in that of the cameras."""
+    """Return in what resolution pixels are, of a database or of points; None if in that of the cameras."""
     matches, view = source.matches, source.view
     if isinstance(matches, DatabaseMatches):
         return recognize_sizes(source.images.sizes_px, matches.sizes_px())
