@@ -18,7 +18,9 @@ lie: in small pictures, and where an object fills their middle, coefficients say
 
 Focal lengths of images that one device took (`scene.sequences`) differ by a tenth, by the median, only if
 they are not determined or if it zoomed. On nine sound models, each of whose images had a lens of its own,
-they differ by 0.05 % to 4 %.
+they differ by 0.05 % to 4 %. Several devices under one numbering, several lenses of a telephone and settings
+of a zoom make few values that return, each known well beside its distance to the next; drawn focal lengths do
+so in 2 % of the cases for ten images, less often for other numbers.
 """
 
 from collections.abc import Iterator
@@ -29,7 +31,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.evidence import Oddity
-from sfm_shapefit.judgement.limits import FEW, FITTING_PX, HALF, SMALLEST_SHAPE
+from sfm_shapefit.judgement.limits import FEW, FITTING_PX, HALF, SMALLEST_SHAPE, SURE_SIGMAS
 from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.lens import Lens
@@ -161,12 +163,32 @@ def find_odd_lenses(images: Images, points: Points, pictures: Pictures, bogus: B
         own = widths[images.lens_of[cameras]]
         if len(np.unique(images.lens_of[cameras])) >= SMALLEST_SHAPE and np.isfinite(own).all():
             logs = np.log([own, images.focal_lengths_px[cameras]])
-            logs = np.abs(logs - np.median(logs, axis=1, keepdims=True))
-            if SIGMA_PER_MEDIAN * np.median(logs, axis=1).min() > FEW:
+            if not any(map(_return_to_few, logs)):
+                logs = np.abs(logs - np.median(logs, axis=1, keepdims=True))
                 far, usual = logs.min(axis=0) > FEW, np.median(own)
                 sentence = "a lens unlike others of one device, as names say: focal length {} picture widths"
                 sentence = f"{sentence}, where {usual:.3g} is usual"
                 yield Oddity(Kind.LENS, False, cameras[far], own[far], sentence)
+
+
+def _return_to_few(logs: FloatArray) -> bool:
+    """Return whether half of some logarithms are of one value, or nearly all of few; see the header."""
+    ordered = np.sort(logs)
+    groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > FEW) + 1)
+    middles = [np.median(group) for group in groups]
+    away = np.diff(middles, prepend=-np.inf, append=np.inf)
+    most = np.minimum(FEW, np.minimum(away[:-1], away[1:]) / SURE_SIGMAS)
+    tight = [
+        len(group)
+        for group, limit in zip(groups, most.tolist(), strict=True)
+        if len(group) >= SMALLEST_SHAPE and _scatter(group) <= limit
+    ]
+    return _scatter(logs) <= FEW or sum(tight) >= (1.0 - FEW) * len(logs)
+
+
+def _scatter(logs: FloatArray) -> float:
+    """Return the standard deviation of logarithms, by their median."""
+    return SIGMA_PER_MEDIAN * float(np.median(np.abs(logs - np.median(logs))))
 
 
 def _reaches(images: Images, points: Points, pictures: Pictures) -> FloatArray:

@@ -15,6 +15,7 @@ from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.judgement.wrong_lenses import is_like_others
+from sfm_shapefit.pipeline.conventions import ask_resolution
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, measure_hold
@@ -128,6 +129,8 @@ def find_remedy(
         for wrong in found.evidence.lenses
         if may_free and images.lenses[wrong.lens].is_adjustable and not intrinsics.parts[wrong.lens, FOCAL]
     }
+    if freed and ask_resolution(source) is not None:
+        freed = {}  # pixels of another resolution ask for another focal length, and are no fault of the lens
     # A camera that is fixed, or held by its rig, cannot go where its pairs are.
     may_move = given.rigid.groups is None and not given.rigid.fixed.any()
     places = found.evidence.places if may_move else ()

@@ -24,17 +24,27 @@ _LEAST_AGREEING = 0.75  # share of the pairs; in another convention nearly all c
 _MOST_TURNED_DEG = 5.0  # degrees; other conventions are off by tens
 
 
+def ask_resolution(source: MatchSource) -> Recognized | None:
+    """Return in what resolution pixels are, of a database or of points; None if in that of the cameras."""
+    matches, view = source.matches, source.view
+    if isinstance(matches, DatabaseMatches):
+        return recognize_sizes(source.images.sizes_px, matches.sizes_px())
+    if isinstance(matches, TrackMatches):
+        pictures = ModelPictures(view.images, view.keypoints, view.num_keypoints)
+        return recognize_resolution(matches.points_of(view.images), view.images, pictures)
+    return None
+
+
 def ask_convention(source: MatchSource, threads: int) -> Recognized | None:
     """Return the convention that the poses of a source look like; None if it is the one they are read by.
 
-    Pictures of another size in the database come first. In rigs of several cameras, whose poses are of
-    frames, no convention is recognized.
+    Another resolution comes first. In rigs of several cameras, whose poses are of frames, no convention is
+    recognized.
     """
     view, folder = source.view, source.inputs.folder
-    if isinstance(source.matches, DatabaseMatches):
-        sizes = recognize_sizes(source.images.sizes_px, source.matches.sizes_px())
-        if sizes is not None:
-            return sizes
+    resolution = ask_resolution(source)
+    if resolution is not None:
+        return resolution
     if source.images.has_rigs or not view.num_pairs:
         return None
     written: PoseFile = "model"
@@ -47,15 +57,6 @@ def ask_convention(source: MatchSource, threads: int) -> Recognized | None:
     return recognize_convention(source.images.rotations, ask_rotations(source, asked, threads), written)
 
 
-def _ask_input(source: MatchSource, threads: int) -> Recognized | None:
-    """Return what an input seems to be instead; without a database, its points are asked first."""
-    view, recognized = source.view, None
-    if isinstance(source.matches, TrackMatches):
-        pictures = ModelPictures(view.images, view.keypoints, view.num_keypoints)
-        recognized = recognize_resolution(source.matches.points_of(view.images), view.images, pictures)
-    return recognized or ask_convention(source, threads)
-
-
 @contextmanager
 def naming_convention(source: MatchSource, threads: int) -> Iterator[None]:
     """Say in what convention the input seems to be, where its cameras cannot be placed.
@@ -66,7 +67,7 @@ def naming_convention(source: MatchSource, threads: int) -> Iterator[None]:
     try:
         yield
     except UnsolvableError as error:
-        if recognized := _ask_input(source, threads):
+        if recognized := ask_convention(source, threads):
             raise UnsolvableError(recognized.sentence) from error
         raise
 
@@ -82,7 +83,7 @@ def _are_rotations_doubtful(found: LocateResult, source: MatchSource) -> bool:
 def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> LocateResult:
     """Return a result that is not good with the convention that its input is in, if that can be told."""
     is_asked = found.verdict.grade is not Grade.GOOD and _are_rotations_doubtful(found, source)
-    recognized = _ask_input(source, threads) if is_asked else None
+    recognized = ask_convention(source, threads) if is_asked else None
     if recognized is None:
         return found
     others = tuple(one for one in found.suspicions if not one.sentence.endswith(IS_ITS_DATABASE))

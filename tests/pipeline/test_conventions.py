@@ -101,6 +101,8 @@ def test_observations_in_another_resolution_are_said_with_their_ratio():
     assert "scaled by 0.8" in found.warnings[0]
     assert found.warnings[0].endswith("may come of that") == (len(found.warnings) > 1)
     assert found.verdict.grade is not Grade.GOOD
+    # A lens of 800 px would fit them as well, but for its principal point: none is freed.
+    assert found.reconstruction.cameras[1].params.tolist() == camera.params.tolist()
 
 
 def test_a_database_of_pictures_in_another_resolution_is_said():
