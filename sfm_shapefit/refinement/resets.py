@@ -114,6 +114,8 @@ def openness(t: FloatArray, edges: IntArray, group: IntArray, noise_rad: FloatAr
 
 def put_back(start: FloatArray, refined: FloatArray, nodes: IntArray) -> FloatArray:
     """Return the refined locations (n, d) with some nodes where the start had them among the others."""
+    if len(nodes) == 0:
+        return refined
     others = np.ones(len(refined), dtype=np.bool_)
     others[nodes] = False
     similarity = fit_similarity_l1(start[others], refined[others], rotate=False)

@@ -310,7 +310,10 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
 
 
 def _descend_from_starts(model: Mixture, problem: _Problem, options: PlacementOptions) -> list[_Candidate]:
-    """Return where the usual start leads to, and others where that leaves pairs unexplained."""
+    """Return where the usual start leads to, and others where that leaves pairs unexplained.
+
+    An end that explains no pair has no noise of its own at which another could be compared with it.
+    """
     # ShapeFit's optimum collapses where the starts disagree, and LUD's cannot.
     is_lud = problem.apart is not None and problem.apart > _UNEQUAL
     name, start = ("LUD", problem.second) if is_lud else ("ShapeFit", problem.first)
@@ -330,7 +333,7 @@ def _descend_from_starts(model: Mixture, problem: _Problem, options: PlacementOp
         end = model.descend(start)
         if end is not None:
             candidates.append(_Candidate(other, start, end, reweighted))
-    return candidates
+    return [candidate for candidate in candidates if candidate.end.posterior.max() > 0.5]
 
 
 def _by_triangles(

@@ -75,6 +75,13 @@ def test_exact_directions_are_recovered_exactly_and_told_from_wrong_ones(d, q):
     assert "by a mixture of noise levels" in found.refined.reason
 
 
+def test_an_end_that_explains_no_pair_does_not_lead():
+    problem = synthetic.random_graph_problem(60, 0.5, q=0.82, seed=8)  # its usual start ends so
+    found = place(problem.view_graph)
+    assert shape_error(found.locations, problem.locations) < 1e-9
+    assert found.refined.start == "reweighted ShapeFit"
+
+
 def test_a_street_of_uneven_noise_is_placed_about_as_well_as_by_its_right_pairs_alone():
     errors = []
     for seed in range(4):
