@@ -377,10 +377,17 @@ class CheckedFacts(FactsOfModel):
     ]
     num_lenses: Annotated[int, "Cameras in COLMAP's sense: lenses of the images with a pose."]
     second_opinion: Annotated[str | None, "Folder that has the models of the second opinion, if any."] = None
+    images: Annotated[str | None, "Folder of the pictures that were matched for this, if any."] = None
 
     @property
     def next_step(self) -> NextStep:
-        """What to do next."""
+        """What to do next, with the folder of the pictures where it is known."""
+        step = self._next()
+        images = shlex.quote(_from_here(self.images)) if self.images else "IMAGES"
+        return step._replace(command=step.command.replace("_path IMAGES", f"_path {images}"))
+
+    def _next(self) -> NextStep:
+        """Return what to do next, by the verdict and by what was asked."""
         path, second, verdict = shlex.quote(self.inputs.path), self.evidence.second, self.verdict
         is_alike = second is not None and second.is_alike
         is_sound = verdict.grade is Grade.GOOD or (verdict.grade is Grade.LOOK and is_alike)
@@ -395,6 +402,9 @@ class CheckedFacts(FactsOfModel):
             return self._next_of_map(second)
         if any(one.kind is Kind.LENS for one in verdict.findings) and not self.evidence.lenses:
             return self._next_of_lenses(path)
+        if self.images:
+            text = "Next: make a database of all its photographs, from which map and locate place them anew."
+            return NextStep(text, "colmap feature_extractor --database_path new.db --image_path IMAGES")
         if verdict.grade is Grade.CANNOT_BE_JUDGED or not (self.inputs.database and self.num_pairs):
             text = (
                 "Next: check it against its photographs, or the database that it was made from (--database)."

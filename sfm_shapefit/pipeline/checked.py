@@ -302,6 +302,7 @@ def _tell(
     errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
     return {
         "inputs": matches.inputs.facts,
+        "images": matches.inputs.images and str(matches.inputs.images),
         "options": {},
         "num_images": len(cameras),
         "num_placed": model.images.num_images,
