@@ -402,19 +402,21 @@ class CheckedFacts(FactsOfModel):
             return self._next_of_map(second)
         if any(one.kind is Kind.LENS for one in verdict.findings) and not self.evidence.lenses:
             return self._next_of_lenses(path)
-        if self.images:
-            text = "Next: make a database of all its photographs, from which map and locate place them anew."
-            return NextStep(text, "colmap feature_extractor --database_path new.db --image_path IMAGES")
         if verdict.grade is Grade.CANNOT_BE_JUDGED or not (self.inputs.database and self.num_pairs):
-            text = (
-                "Next: check it against its photographs, or the database that it was made from (--database)."
-            )
-            return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")
+            return self._next_of_evidence(path)
         if verdict.doubts_database:
             text = "Next: check it against the database that it was made from."
             return NextStep(text, f"sfm-shapefit check {path} --database ITS_DATABASE")
         text = "Next: place the cameras anew from their rotations and matches, and compare."
         return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
+
+    def _next_of_evidence(self, path: str) -> NextStep:
+        """Return how to get more evidence: from the photographs, else, if these were asked, from all pairs."""
+        if self.images:
+            text = "Next: make a database of all its photographs, from which map and locate place them anew."
+            return NextStep(text, "colmap feature_extractor --database_path new.db --image_path IMAGES")
+        text = "Next: check it against its photographs, or the database that it was made from (--database)."
+        return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")
 
     def _next_of_map(self, second: ToldOpinion) -> NextStep:
         """Return how to take the model that `map` makes of the database: the one that was kept, or anew."""
