@@ -413,7 +413,7 @@ class CheckedFacts(FactsOfModel):
     def _next_of_evidence(self, path: str) -> NextStep:
         """Return how to get more evidence: from the photographs, else, if these were asked, from all pairs."""
         if self.images:
-            text = "Next: make a database of all its photographs, from which map and locate place them anew."
+            text = "Next: make a database of all its photographs, from which `map` places all anew."
             return NextStep(text, "colmap feature_extractor --database_path new.db --image_path IMAGES")
         text = "Next: check it against its photographs, or the database that it was made from (--database)."
         return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")

@@ -4,7 +4,7 @@ Do not use, if any of these holds:
 
     the pairs that agree hold less than half of the cameras in one rigid piece, also with the points that fit,
     however many contradict
-    no more pairs agree than join the cameras, and as many or more contradict
+    no more pairs agree than join the cameras, and as many contradict (half as many: look)
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than half of all images are in the output
@@ -129,16 +129,17 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
 
 
 def _too_few_agree(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
-    """Yield that no more pairs agree than join the cameras, and as many contradict.
+    """Yield that no more pairs agree than join the cameras, and half as many contradict, or as many.
 
     Where matches are noise, or what they see moves, each pair is one more false pose, and those that joined
     the cameras agree.
     """
     agreeing, against = evidence.sides
-    if 0 < agreeing <= against and agreeing < len(np.unique(images.frame_of[images.is_posed])):
+    joining = 0 < agreeing < len(np.unique(images.frame_of[images.is_posed]))
+    if joining and against >= HALF * agreeing:
         clause = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
         clause = f"{clause}, and only {agreeing} agree{'s' * (agreeing == 1)}, too few to check it"
-        yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
+        yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE if against >= agreeing else Grade.LOOK)
 
 
 def _weigh_oddities(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
