@@ -411,7 +411,7 @@ class CheckedFacts(FactsOfModel):
         return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
 
     def _next_of_evidence(self, path: str) -> NextStep:
-        """Return how to get more evidence: from the photographs, else, if these were asked, from all pairs."""
+        """Return how to get more evidence: from photographs, or from all pairs of them if asked."""
         if self.images:
             text = "Next: make a database of all its photographs, from which `map` places all anew."
             return NextStep(text, "colmap feature_extractor --database_path new.db --image_path IMAGES")
