@@ -377,10 +377,17 @@ class CheckedFacts(FactsOfModel):
     ]
     num_lenses: Annotated[int, "Cameras in COLMAP's sense: lenses of the images with a pose."]
     second_opinion: Annotated[str | None, "Folder that has the models of the second opinion, if any."] = None
+    images: Annotated[str | None, "Folder of the pictures that were matched for this, if any."] = None
 
     @property
     def next_step(self) -> NextStep:
-        """What to do next."""
+        """What to do next, with the folder of the pictures where it is known."""
+        step = self._next()
+        images = shlex.quote(_from_here(self.images)) if self.images else "IMAGES"
+        return step._replace(command=step.command.replace("_path IMAGES", f"_path {images}"))
+
+    def _next(self) -> NextStep:
+        """Return what to do next, by the verdict and by what was asked."""
         path, second, verdict = shlex.quote(self.inputs.path), self.evidence.second, self.verdict
         is_alike = second is not None and second.is_alike
         is_sound = verdict.grade is Grade.GOOD or (verdict.grade is Grade.LOOK and is_alike)
@@ -396,15 +403,20 @@ class CheckedFacts(FactsOfModel):
         if any(one.kind is Kind.LENS for one in verdict.findings) and not self.evidence.lenses:
             return self._next_of_lenses(path)
         if verdict.grade is Grade.CANNOT_BE_JUDGED or not (self.inputs.database and self.num_pairs):
-            text = (
-                "Next: check it against its photographs, or the database that it was made from (--database)."
-            )
-            return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")
+            return self._next_of_evidence(path)
         if verdict.doubts_database:
             text = "Next: check it against the database that it was made from."
             return NextStep(text, f"sfm-shapefit check {path} --database ITS_DATABASE")
         text = "Next: place the cameras anew from their rotations and matches, and compare."
         return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
+
+    def _next_of_evidence(self, path: str) -> NextStep:
+        """Return how to get more evidence: from photographs, or from all pairs of them if asked."""
+        if self.images:
+            text = "Next: make a database of all its photographs, from which `map` places all anew."
+            return NextStep(text, "colmap feature_extractor --database_path new.db --image_path IMAGES")
+        text = "Next: check it against its photographs, or the database that it was made from (--database)."
+        return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")
 
     def _next_of_map(self, second: ToldOpinion) -> NextStep:
         """Return how to take the model that `map` makes of the database: the one that was kept, or anew."""

@@ -107,8 +107,13 @@ class Inputs:
     """Pairs that are taken for unmatched."""
     is_found: bool = False
     """Whether the database was found beside the model, and nobody asked for it."""
-    is_made: bool = False
-    """Whether the database was made of the model's pictures, for this run alone."""
+    images: Path | None = None
+    """Folder of the pictures that the database was made of, for this run alone; None for any other."""
+
+    @property
+    def is_made(self) -> bool:
+        """Whether the database was made of the model's pictures."""
+        return self.images is not None
 
     @property
     def facts(self) -> ModelInputs:

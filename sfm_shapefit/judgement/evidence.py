@@ -256,6 +256,8 @@ class ModelEvidence:
     """By rows of the images."""
     num_held: int | None = None
     """Cameras of the largest group that agreeing pairs, or points that fit, hold; None without pairs."""
+    sides: tuple[int, int] = (0, 0)
+    """Pairs that agree, and that contradict."""
     second: SecondOpinion | None = None
     """How another model of the same matches compares; None if there is none."""
     shape: OpenShape | None = None

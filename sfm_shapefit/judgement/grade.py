@@ -4,6 +4,7 @@ Do not use, if any of these holds:
 
     the pairs that agree hold less than half of the cameras in one rigid piece, also with the points that fit,
     however many contradict
+    no more pairs agree than join the cameras, and as many contradict (half as many: look)
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than half of all images are in the output
@@ -95,6 +96,8 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     if held is not None and (held < HALF * count or held < SMALLEST_PIECE <= count):  # any pair holds two
         clause = f"the pairs that agree hold only {held} of {counted(count, 'camera')}"
         yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
+    else:
+        yield from _too_few_agree(evidence, images)
     if len(named - confirmed) > MANY * count and len(named) > len(apart):
         clause = f"evidence speaks against {len(named)} of {counted(count, 'camera')}"
         yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
@@ -123,6 +126,20 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
         if second.has_nothing_in_common:
             clause = "the model that map makes of the same database has another shape"
             yield of_model(Kind.APART, clause)
+
+
+def _too_few_agree(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
+    """Yield that no more pairs agree than join the cameras, and half as many contradict, or as many.
+
+    Where matches are noise, or what they see moves, each pair is one more false pose, and those that joined
+    the cameras agree.
+    """
+    agreeing, against = evidence.sides
+    joining = 0 < agreeing < len(np.unique(images.frame_of[images.is_posed]))
+    if joining and against >= HALF * agreeing:
+        clause = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
+        clause = f"{clause}, and only {agreeing} agree{'s' * (agreeing == 1)}, too few to check it"
+        yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE if against >= agreeing else Grade.LOOK)
 
 
 def _weigh_oddities(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:

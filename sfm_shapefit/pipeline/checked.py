@@ -268,7 +268,7 @@ def _reasons(
     against = list(weigh_evidence(evidence, model.images))
     yield from against
     if fits is not None and not any(one.grade is Grade.DO_NOT_USE for one in against):
-        yield from _strange_pairs(model.images, fits, matches)
+        yield from _none_agrees(fits, matches)
     confirmed = [] if evidence.second is None else evidence.second.confirmed.tolist()
     right = {model.images.names[k] for k in confirmed}
     yield from (one for one in weak if not right.issuperset(one.images))
@@ -280,21 +280,13 @@ def _reasons(
         yield of_model(Kind.INPUT, clause)
 
 
-def _strange_pairs(images: Images, fits: PairFits, matches: MatchSource) -> Iterator[Reason]:
-    """Yield that pairs contradict, and none agrees, or too few to check one another.
-
-    A model's own points tie it whatever its database is. Where matches are noise, each pair is one more false
-    pose: as many agree as join the cameras, and most others contradict.
-    """
-    against, agreeing = (int(side.sum()) for side in (fits.contradicts, fits.agrees))
-    pairs = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
-    if against and not agreeing:
+def _none_agrees(fits: PairFits, matches: MatchSource) -> Iterator[Reason]:
+    """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
+    if (against := int(fits.contradicts.sum())) and not fits.agrees.any():
         whose = ARE_ITS_PICTURES if matches.inputs.is_made else IS_ITS_DATABASE
         asked = f": {whose}" * (matches.inputs.database is not None)
+        pairs = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
         yield of_model(Kind.INPUT, f"{pairs} and none agrees{asked}", Grade.DO_NOT_USE)
-    elif against > agreeing and agreeing < len(np.unique(images.frame_of[images.is_posed])):
-        clause = f"{pairs}, and only {agreeing} agree, too few to check it"
-        yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
 
 
 def _tell(
@@ -310,6 +302,7 @@ def _tell(
     errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
     return {
         "inputs": matches.inputs.facts,
+        "images": matches.inputs.images and str(matches.inputs.images),
         "options": {},
         "num_images": len(cameras),
         "num_placed": model.images.num_images,

@@ -74,6 +74,7 @@ def gather_evidence(
         contradicted=tuple(one for one in contradicted if not sure[one.camera]),
         untied=tuple(one for one in untied if 2 * np.isin(one.cameras, apart).sum() < len(one.cameras)),
         num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)) + num_unasked,
+        sides=(int(fits.agrees.sum()), int(fits.contradicts.sum())),
     )
 
 

@@ -70,7 +70,7 @@ def match_pictures(model: ColmapModel, asked: AskedPictures, clock: Clock) -> It
             )
         pictures.name_images()
         statement = _state(asked.folder, states, chosen.reasons, count)
-        yield Inputs(folder=None, database=path, statement=statement, is_made=True)
+        yield Inputs(folder=None, database=path, statement=statement, images=asked.folder)
 
 
 def _refuse_no_pictures(folder: Path, names: Sequence[str], states: Sequence[str]) -> None:

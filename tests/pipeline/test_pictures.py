@@ -15,7 +15,7 @@ from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from tests.program import run, run_refused
 from tests.scenes import RING, fingerprint
 
-OPTIONS = SceneOptions(shape="facade", num_images=8, image_width=480, image_height=360, focal_length_px=420.0)
+OPTIONS = SceneOptions(shape="facade", num_images=8, image_width=360, image_height=270, focal_length_px=315.0)
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +42,7 @@ def test_poses_alone_are_good_by_their_pictures_and_nothing_is_written(drawn):
     assert "verdict: good" in result.output
     assert "8 of 8 pictures in" in result.output
     assert "neighbors" in result.output
+    assert f"--image_path {drawn / 'images'}" in result.output  # the next step knows the folder
     assert fingerprint(drawn) == before
 
 
@@ -60,11 +61,11 @@ def test_pictures_of_another_size_or_shape_or_lost_are_counted(drawn, tmp_path):
     inner.mkdir()
     for name in names[2:]:
         picture = pycolmap.Bitmap.read(drawn / "images" / name, True)
-        picture.rescale(360, 270)
+        picture.rescale(270, 202)
         picture.write(inner / name)
     (inner / names[2]).write_bytes(b"no picture")
     narrow = pycolmap.Bitmap.read(drawn / "images" / names[3], True)
-    narrow.rescale(240, 360)
+    narrow.rescale(180, 270)
     narrow.write(inner / names[3])
     found = check(drawn / "sparse" / "0", images=tmp_path, second_opinion=False)  # in a subfolder
     directions = found.facts.inputs.directions
