@@ -197,8 +197,8 @@ def without_unseen_turns(
     least = np.where(errors.are_wrong, _BETTER, _CLEARLY_BETTER)
     are_wrong = ~problem.fixed & (held > least * fitting * freed)
     sigmas = np.where(are_wrong, np.inf, 0.0)
-    told = {"sigma_rad": 0.0, "frame_sigmas_rad": sigmas, "are_wrong": are_wrong}
-    return replace(errors, **told, are_unseen=bool(turn and not are_wrong.any()))
+    are_unseen = bool(turn and not are_wrong.any())
+    return replace(errors, sigma_rad=0.0, frame_sigmas_rad=sigmas, are_wrong=are_wrong, are_unseen=are_unseen)
 
 
 class _Halves(NamedTuple):
