@@ -72,7 +72,8 @@ class Estimate:
             return f"centers, points and rotations adjusted, rotations {kept}, as asked"
         chance = f"{math.degrees(self.errors.chance_rad):.2g} deg"
         if self.freedom.holds_rotations:
-            return f"centers and points adjusted, rotations held: freed, they would turn by chance ({chance})"
+            why = "and fit hardly better" if self.errors.are_unseen else f"by chance ({chance})"
+            return f"centers and points adjusted, rotations held: freed, they would turn {why}"
         if self.errors.sigma_rad == 0.0:
             freed = counted(int(self.errors.are_wrong.sum()), "rotation")
             return (

@@ -80,7 +80,7 @@ _THIN_LIMIT, _THIN_SCALE, _THIN_FALL = 4.0, 0.25, 1e-4
 _FIRST_DAMPING, _NEAR_DAMPING = AdjustmentOptions().first_damping, 1e-8
 # Tracks that hold each image in a fine solve, in those of the thin one. With 1, the median errors of six real
 # scenes are 1.0 to 1.3 times those with 3, and of a facade of 300 images 1.6 times; 6 is no better.
-_FINE_TIMES = 3
+FINE_TIMES = 3
 # Share of the observations of `_THIN_LIMIT` that the threshold finds too; with less, poses are coarse.
 _FINE = 0.9
 # Solves repeated with lenses held that were left open; each takes as long as the first.
@@ -368,7 +368,7 @@ def solve_coarsely(run: AdjustmentRun, coarse: AdjustmentProblem | None = None) 
 def fine_problem(run: AdjustmentRun) -> AdjustmentProblem | None:
     """Return the problem of some more points at the threshold; None if there are none."""
     joined, found = run.triangulate(1.0)
-    return run.thin_problem(joined, found, times=_FINE_TIMES) if len(found.points) else None
+    return run.thin_problem(joined, found, times=FINE_TIMES) if len(found.points) else None
 
 
 def solve_finely(run: AdjustmentRun, problem: AdjustmentProblem, *, near: bool = True) -> Solved:
@@ -408,7 +408,7 @@ def problem_of_poses(run: AdjustmentRun) -> tuple[AdjustmentProblem | None, Adju
     """Return the fine problem; None where the points found say that poses are coarse, and the coarse one."""
     joined, found = run.triangulate(1.0)
     checked = found.of_length(run.checked_length)
-    problem = run.thin_problem(joined, found, times=_FINE_TIMES) if len(checked.points) else None
+    problem = run.thin_problem(joined, found, times=FINE_TIMES) if len(checked.points) else None
     del joined, found  # whose arrays have all matches
     coarse = _coarse_points(run, checked)
     return (None, run.thin_problem(*coarse)) if coarse else (problem, None)
