@@ -15,18 +15,18 @@ MOST_ARROWS = 75  # between rooms, beside those to base/; the list may only beco
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
-    "adjustment": 4890,
+    "adjustment": 4910,
     "base": 2430,
     "cli": 1940,
-    "facts": 3760,
+    "facts": 3770,
     "files": 7130,
     "graph": 1370,
-    "judgement": 4510,
+    "judgement": 4560,
     "laplacian": 2190,
     "pairs": 1690,
     "pipeline": 7510,
     "placement": 3070,
-    "refinement": 2800,
+    "refinement": 2810,
     "report": 1600,
     "rotations": 2250,
     "scene": 2600,
