@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.scene.images import Images
 
@@ -115,7 +116,7 @@ def _first(pairs: IntArray, most: int, count: int) -> tuple[IntArray, IntArray]:
 def _across_seams(near: _Ranked, shared: Shared, alike: _Ranked) -> tuple[IntArray, IntArray]:
     """Return pairs across the longest edges of the shortest tree, and which of its seam each is."""
     from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+    from scipy.sparse.csgraph import minimum_spanning_tree
 
     count, (among, costs) = len(near.others), (near.pairs(), near.costs.ravel())
     ends = np.concatenate([shared.pairs, among])
@@ -126,8 +127,7 @@ def _across_seams(near: _Ranked, shared: Shared, alike: _Ranked) -> tuple[IntArr
     found, ranks = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     for edge in np.argsort(-length, kind="stable")[: -(-count // _IMAGES_A_SEAM)].tolist():
         left = np.arange(len(length)) != edge
-        cut = coo_array((length[left], (i[left], j[left])), shape=(count, count))
-        sides = connected_components(cut, directed=False)[1]
+        sides = connected_components(count, np.column_stack([i, j])[left].astype(np.int64))
         side = sides == sides[i[edge]]
         for ranked in (near, alike):
             pairs, cost = ranked.pairs(), ranked.costs.ravel()

@@ -1,7 +1,6 @@
 """`check FOLDER` of several models of one set of images, as COLMAP's mapper leaves them: one table."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -9,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.base.errors import InputError, ShapeFitError
+from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
 from sfm_shapefit.facts.map_result import MapResult
@@ -48,8 +47,12 @@ def check_pieces(
         raise InputError(f"{folder} has no models 0, 1, ...; give a folder of several, or `check` one")
     source = database if database is not None else find_database(models[0])
     if second_opinion is True and source is not None:
-        with suppress(ShapeFitError):  # `check` says why
+        try:
             second_opinion = map_database(source, progress=progress)
+        except UnsolvableError:
+            second_opinion = False  # nor could `check` map it, for any of the models
+        except InputError:
+            pass  # `check` says why
     pieces, images = [], dict[str, Images]()
     for path in models:
         name = str(path)

@@ -77,21 +77,25 @@ def _refuse_no_pictures(folder: Path, names: Sequence[str], states: Sequence[str
     """Raise InputError if hardly a picture can be asked."""
     if states.count("asked") >= 2:
         return
-    whys = ", ".join(f"{num:,} {why}" for why, num in Counter(states).items() if why != "asked")
     raise InputError(
-        f"{folder} has no two pictures of this model ({whys}); give the folder in which the names "
+        f"{folder} has no two pictures of this model ({_whys(states)}); give the folder in which the names "
         f"of its images begin, such as {names[0]}"
     )
 
 
 def _state(folder: Path, states: Sequence[str], reasons: Sequence[str], count: int) -> str:
     """Say what was asked, why, and what was not."""
-    counts = Counter(states)
-    others = [f"{num:,} {why}" for why, num in counts.items() if why != "asked"]
-    without = f" ({', '.join(others)})" if others else ""
-    whys = ", ".join(f"{num:,} {why}" for why, num in Counter(reasons[:count]).items())
+    others = _whys(states)
+    without = f" ({others})" if others else ""
     asked = counted(count, "pair") if count == len(reasons) else f"{count:,} of {len(reasons):,} chosen pairs"
-    return f"{counts['asked']:,} of {counted(len(states), 'picture')}{without} in {folder}, {asked}: {whys}"
+    num_asked = states.count("asked")
+    pictures = f"{num_asked:,} of {counted(len(states), 'picture')}{without} in {folder}"
+    return f"{pictures}, {asked}: {_whys(reasons[:count])}"
+
+
+def _whys(whys: Sequence[str]) -> str:
+    """Say how often each reason is given, but for that of pictures which were asked."""
+    return ", ".join(f"{num:,} {why}" for why, num in Counter(whys).items() if why != "asked")
 
 
 def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:

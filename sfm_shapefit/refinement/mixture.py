@@ -281,7 +281,7 @@ class Mixture:
         """Return the errors of the directions at locations, which are centered and scaled."""
         baselines, v = differences(t, self._graph.edges), self._graph.directions
         lengths = np.linalg.norm(baselines, axis=1)
-        unit = max(float(np.median(lengths)), float(np.finfo(float).tiny))
+        unit = max(float(np.median(lengths)), _TINY)
         floored = np.maximum(lengths / unit, _SHORTEST)
         units = baselines / (unit * floored)[:, None]
         angles = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(units - v, axis=1), 1.0))
@@ -289,7 +289,7 @@ class Mixture:
         errors = along.copy()
         sines = np.linalg.norm(errors, axis=1)
         # Scaled to the angle, beyond 90 degrees too; straight behind, any axis will do.
-        behind = sines <= np.finfo(float).tiny
+        behind = sines <= _TINY
         errors[behind, 0], sines[behind] = 1.0, 1.0
         scaled = np.asarray((t - t.mean(axis=0)) / unit)
         across = self._axes - units[:, :, None] * along[:, None, :]

@@ -128,7 +128,6 @@ class RefinedPlacement:
     """The program at other weights that the locations come from, certified; None where another was kept."""
     variances: FloatArray | None = None
     """(m,) variance per axis of each direction if it is right, rad^2; None where one level serves all."""
-
     rivals: tuple[Rival, ...] = ()
     """Where other starts led to under a mixture, most evidence first; often to the place of the kept one."""
 
@@ -278,20 +277,15 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
     """Return the end of most evidence under a mixture of noise levels; None if the graph has no such end."""
     measured, plan = problem.measured, problem.normal_solver
     is_bare = measured.evidence is None and measured.num_points == 0
-    if options.objective != "auto" or not (
-        is_bare and isinstance(plan, SymbolicFactor) and can_be_reweighted(measured)
-    ):
+    if not (options.objective == "auto" and is_bare and can_be_reweighted(measured)):
+        return None
+    if not isinstance(plan, SymbolicFactor):
         return None
     model = Mixture(measured, plan)
     candidates = _descend_from_starts(model, problem, options)
     if not candidates:
         return None
-    best = candidates[0]
-    for other in candidates[1:]:
-        best = other if model.lead(other.end, best.end) > 0.0 else best
-    end = model.improve(best.end)
-    others = (found.end for found in candidates if found is not best)
-    rivals = sorted((Rival(end=x, behind=model.lead(end, x)) for x in others), key=lambda rival: rival.behind)
+    best, end, rivals = _compare_ends(model, candidates)
     fallback = problem.first if problem.second is None else problem.second
     right, noise = end.posterior > 0.5, np.sqrt(end.variances)
     strays = find_strays(measured.graph, fallback, end.locations, right, noise)
@@ -307,6 +301,17 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
         reason += f"; {_say_certified(best.reweighted)}"
     costs = {found.name: -found.end.bound for found in candidates}
     return _Kept(start, reason, costs, levels, end.posterior, best.reweighted, end.variances, tuple(rivals))
+
+
+def _compare_ends(model: Mixture, candidates: list[_Candidate]) -> tuple[_Candidate, MixtureEnd, list[Rival]]:
+    """Return the candidate of most evidence, the end that it is improved to, and the others beside that."""
+    best = candidates[0]
+    for other in candidates[1:]:
+        best = other if model.lead(other.end, best.end) > 0.0 else best
+    end = model.improve(best.end)
+    others = (found.end for found in candidates if found is not best)
+    rivals = sorted((Rival(end=x, behind=model.lead(end, x)) for x in others), key=lambda rival: rival.behind)
+    return best, end, rivals
 
 
 def _descend_from_starts(model: Mixture, problem: _Problem, options: PlacementOptions) -> list[_Candidate]:

@@ -9,11 +9,8 @@ from sfm_shapefit.scene.lens import Lens
 _ONE_TO_ONE = ("SIMPLE_PINHOLE", "PINHOLE")
 # Distance in pixels by which a pixel may miss itself over its ray and back; solving for the ray leaves 1e-8.
 _ROUND_TRIP_PX = 0.01
-_MAPPER_ALLOWS = (
-    0.1,
-    10.0,
-    1.0,
-)  # focal lengths in longer sides, and other parameters; defaults of COLMAP's mapper
+# Focal lengths in longer sides, least and largest, and other parameters; defaults of COLMAP's mapper.
+_MAPPER_ALLOWS = (0.1, 10.0, 1.0)
 
 
 def camera_of(lens: Lens) -> pycolmap.Camera:
