@@ -74,12 +74,15 @@ _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; abov
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
 _LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.003  # nats; a smaller change of the bound is none
+_SMALL_STEP = 1e-3  # nats that a step promises; below, it is taken unseen, since rounding may hide the gain
+_MET = 0.1  # levels; a descent that passes all right pairs of another so closely ends where that does
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
 _FAR = 3.0  # typical levels, at a node's mean log length; a consensus that moves none so far gains nothing
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
 _TYPICAL = 0.84  # standard score of a log level; the level that four of five have at most
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
 _UNKNOWN = 1e-6  # probability of being right; a direction of less has the usual variance
+_RIGHT = 0.5  # probability; directions of more are right
 _MOST_LEVERAGE = 0.9  # share of a residual's variance; nothing but the pair holds such a camera
 _WEIGH_ROUNDS = 3  # rounds of share and variances at locations that stay; they settle in as many
 _TINY = float(np.finfo(np.float64).tiny)
@@ -186,10 +189,18 @@ class Mixture:
         self._peak = float(np.exp(log_sphere - 0.5 * (d - 1) * np.log(2.0 * np.pi)))
         self._factor = allocate_factor(plan, d)
         self._least_gain = max(_LEAST_GAIN, _LEAST_GAIN_A_CAMERA * graph.num_nodes)
+        self._descents: list[tuple[list[FloatArray], MixtureEnd]] = []  # paths from starts, and their ends
 
     def descend(self, start: FloatArray) -> MixtureEnd | None:
-        """Return where a descent from (n, d) locations ends; None if its equations are singular."""
-        return self._descend(start, _FIRST_FLOOR_RAD, _FIRST_LEVELS)
+        """Return where a descent from (n, d) locations ends; None if its equations are singular.
+
+        That is the end of an earlier descent, the very same object, where it meets the path of that.
+        """
+        path = list[FloatArray]()
+        end = self._descend(start, _FIRST_FLOOR_RAD, _FIRST_LEVELS, path)
+        if end is not None:
+            self._descents.append((path, end))
+        return end
 
     def improve(self, end: MixtureEnd) -> MixtureEnd:
         """Return the end of most evidence that consensus and descents, in turn, lead to."""
@@ -223,11 +234,18 @@ class Mixture:
             bound, variances = self._log_determinant(system, noise) - system.cost, self._propagate(at)
         return bound
 
-    def _descend(self, start: FloatArray, floor: float, levels: Levels) -> MixtureEnd | None:
+    def _descend(
+        self, start: FloatArray, floor: float, levels: Levels, path: list[FloatArray] | None = None
+    ) -> MixtureEnd | None:
+        """Return the end of a descent; with a path, which gets the locations of each step, see `descend`."""
         at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances = np.zeros_like(self._own)
         for _ in range(_MOST_STEPS):
             levels, found = self._fit(at.errors**2 + variances, levels, floor)
+            if path is not None:
+                path.append(at.locations)
+                if (met := self._meet(path, at.lengths, max(floor, levels.typical))) is not None:
+                    return met
             noise = _Noise(levels, floor, variances, self._precision(at.lengths))
             system = self._equations(at, noise.precision, found)
             moved, damping = self._step(at, noise, system, damping)
@@ -240,6 +258,16 @@ class Mixture:
             variances = self._propagate(at)
             at, floor = moved, max(floor * _FALL, _LEVELS_RAD[0])
         return None if last is None else self._judge(*last)
+
+    def _meet(self, path: list[FloatArray], lengths: FloatArray, level: float) -> MixtureEnd | None:
+        """Return the end of an earlier descent that was, after as many steps, where a path is now."""
+        step = len(path) - 1
+        for other, end in self._descents:
+            if step < len(other):
+                apart = np.linalg.norm(differences(path[step] - other[step], self._graph.edges), axis=1)
+                if np.all((apart < _MET * level * lengths)[end.posterior > _RIGHT]):
+                    return end
+        return None
 
     def _draw_in(self, t: FloatArray) -> FloatArray:
         """Return locations with the nodes whose pairs are very long amid their neighbors.
@@ -270,9 +298,9 @@ class Mixture:
         right = -adjoint(system.gradient, self._graph.edges, self._graph.num_nodes)
         while damping <= _DAMPING[2]:
             if self._refactor(system, damping):
-                proposed = self._draw_in(at.locations + self._factor.solve(right))
-                there = self._residuals(proposed)
-                if self._cost(there, noise) < system.cost:
+                step = self._factor.solve(right)
+                there = self._residuals(self._draw_in(at.locations + step))
+                if np.vdot(right, step) < _SMALL_STEP or self._cost(there, noise) < system.cost:
                     return there, max(damping / 10.0, _DAMPING[1])
             damping *= 10.0
         return at if self._refactor(system, _DAMPING[1]) else None, _DAMPING[0]
