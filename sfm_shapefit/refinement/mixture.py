@@ -73,9 +73,9 @@ _LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; e^4, twice 
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
-_LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.003  # nats; a smaller change of the bound is none
+_LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.01  # nats; a smaller change of the bound is none
 _SMALL_STEP = 1e-3  # nats that a step promises; below, it is taken unseen, since rounding may hide the gain
-_MET = 0.1  # levels; a descent that passes all right pairs of another so closely ends where that does
+_MET = 0.1  # levels; a descent that passes all right pairs of another so closely ends where that did
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
 _FAR = 3.0  # typical levels, at a node's mean log length; a consensus that moves none so far gains nothing
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
@@ -128,11 +128,20 @@ class MixtureEnd:
     """(m,) variance per axis of the error of each direction if it is right, rad^2, own part included."""
     levels: Levels
     """Share and noise of the right directions."""
+    looseness: FloatArray
+    """(m, d - 1) variance of each residual by that of the locations, rad^2."""
 
     @property
     def right_share(self) -> float:
         """Share of the directions that are right."""
         return self.levels.right
+
+
+class _Descent(NamedTuple):
+    """How a descent went."""
+
+    path: list[FloatArray]  # (n, d) locations of each step
+    end: MixtureEnd
 
 
 class _Residuals(NamedTuple):
@@ -189,18 +198,18 @@ class Mixture:
         self._peak = float(np.exp(log_sphere - 0.5 * (d - 1) * np.log(2.0 * np.pi)))
         self._factor = allocate_factor(plan, d)
         self._least_gain = max(_LEAST_GAIN, _LEAST_GAIN_A_CAMERA * graph.num_nodes)
-        self._descents: list[tuple[list[FloatArray], MixtureEnd]] = []  # paths from starts, and their ends
+        self._descents: list[_Descent] = []
 
     def descend(self, start: FloatArray) -> MixtureEnd | None:
         """Return where a descent from (n, d) locations ends; None if its equations are singular.
 
         That is the end of an earlier descent, the very same object, where it meets the path of that.
         """
-        path = list[FloatArray]()
-        end = self._descend(start, _FIRST_FLOOR_RAD, _FIRST_LEVELS, path)
-        if end is not None:
-            self._descents.append((path, end))
-        return end
+        descent = self._descend(start, _FIRST_FLOOR_RAD, _FIRST_LEVELS, self._descents)
+        if descent is None:
+            return None
+        self._descents.append(descent)
+        return descent.end
 
     def improve(self, end: MixtureEnd) -> MixtureEnd:
         """Return the end of most evidence that consensus and descents, in turn, lead to."""
@@ -208,10 +217,11 @@ class Mixture:
             moved = self._put_by_consensus(end)
             if np.array_equal(moved, end.locations):
                 break
-            found = self._descend(moved, min(_NEXT_FLOOR * end.levels.typical, _FIRST_FLOOR_RAD), end.levels)
-            if found is None or found.bound <= end.bound + _ROUND_GAIN:
+            floor, before = min(_NEXT_FLOOR * end.levels.typical, _FIRST_FLOOR_RAD), _Descent([], end)
+            found = self._descend(moved, floor, end.levels, [before])
+            if found is None or found.end.bound <= end.bound + _ROUND_GAIN:
                 break
-            end = found
+            end = found.end
         return end
 
     def lead(self, end: MixtureEnd, other: MixtureEnd) -> float:
@@ -223,7 +233,7 @@ class Mixture:
         """Return the bound at the locations of an end, where right directions have such levels."""
         if end.levels is levels:
             return end.bound
-        at, bound, variances = self._residuals(end.locations), -np.inf, np.zeros_like(self._own)
+        at, bound, variances = self._residuals(end.locations), -np.inf, end.looseness
         for _ in range(_WEIGH_ROUNDS):
             expected = at.errors**2 + variances
             levels = levels._replace(right=_right_share(self._expect(expected, levels, 0.0).sums))
@@ -235,19 +245,19 @@ class Mixture:
         return bound
 
     def _descend(
-        self, start: FloatArray, floor: float, levels: Levels, path: list[FloatArray] | None = None
-    ) -> MixtureEnd | None:
-        """Return the end of a descent; with a path, which gets the locations of each step, see `descend`."""
+        self, start: FloatArray, floor: float, levels: Levels, others: list[_Descent]
+    ) -> _Descent | None:
+        """Return a descent from (n, d) locations, or the other that it meets."""
         at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
-        variances = np.zeros_like(self._own)
-        for _ in range(_MOST_STEPS):
+        variances, path = np.zeros_like(self._own), list[FloatArray]()
+        for step in range(_MOST_STEPS):
             levels, found = self._fit(at.errors**2 + variances, levels, floor)
-            if path is not None:
-                path.append(at.locations)
-                if (met := self._meet(path, at.lengths, max(floor, levels.typical))) is not None:
-                    return met
+            for other in others:
+                if self._meet(other, step, at, max(floor, levels.typical)):
+                    return other
             noise = _Noise(levels, floor, variances, self._precision(at.lengths))
             system = self._equations(at, noise.precision, found)
+            path.append(at.locations)
             moved, damping = self._step(at, noise, system, damping)
             if moved is None:
                 break
@@ -257,17 +267,13 @@ class Mixture:
                 break
             variances = self._propagate(at)
             at, floor = moved, max(floor * _FALL, _LEVELS_RAD[0])
-        return None if last is None else self._judge(*last)
+        return None if last is None else _Descent(path, self._judge(*last))
 
-    def _meet(self, path: list[FloatArray], lengths: FloatArray, level: float) -> MixtureEnd | None:
-        """Return the end of an earlier descent that was, after as many steps, where a path is now."""
-        step = len(path) - 1
-        for other, end in self._descents:
-            if step < len(other):
-                apart = np.linalg.norm(differences(path[step] - other[step], self._graph.edges), axis=1)
-                if np.all((apart < _MET * level * lengths)[end.posterior > _RIGHT]):
-                    return end
-        return None
+    def _meet(self, other: _Descent, step: int, at: _Residuals, level: float) -> bool:
+        """Return whether all right pairs are where another descent had them after as many steps."""
+        there = other.path[step] if step < len(other.path) else other.end.locations
+        apart = np.linalg.norm(differences(at.locations - there, self._graph.edges), axis=1)
+        return bool(np.all((apart < _MET * level * at.lengths)[other.end.posterior > _RIGHT]))
 
     def _draw_in(self, t: FloatArray) -> FloatArray:
         """Return locations with the nodes whose pairs are very long amid their neighbors.
@@ -360,6 +366,7 @@ class Mixture:
             posterior=np.minimum(right, _posterior(levels, likelihood)),
             variances=np.maximum(variances, _LEVELS_RAD[0] ** 2),
             levels=levels,
+            looseness=noise.variances,
         )
 
     def _precision(self, lengths: FloatArray) -> float:

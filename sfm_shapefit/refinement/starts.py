@@ -309,7 +309,7 @@ def _compare_ends(model: Mixture, candidates: list[_Candidate]) -> tuple[_Candid
     for other in candidates[1:]:
         best = other if model.lead(other.end, best.end) > 0.0 else best
     end = model.improve(best.end)
-    others = (found.end for found in candidates if found is not best)
+    others = (found.end for found in candidates if found.end is not best.end)
     rivals = sorted((Rival(end=x, behind=model.lead(end, x)) for x in others), key=lambda rival: rival.behind)
     return best, end, rivals
 
