@@ -90,7 +90,7 @@ def judge(placement: Placement, options: PlacementOptions) -> Judged:
     second = (
         (find_rival(placement.refined) if is_bare else None)
         or find_second_configuration(part.graph, part.pairs, agreement.agrees, assessment.level_deg)
-        or (find_fold(part.graph, agreement.agrees) if is_bare else None)
+        or (find_fold(part.graph, agreement.agrees, placement.refined.triangles) if is_bare else None)
     )
     if second is not None:
         second = replace(second, cameras=placement.nodes[second.cameras])

@@ -36,7 +36,7 @@ from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, med
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.placement.conditioning import LOOSE_SHARE
-from sfm_shapefit.refinement.posterior import weigh_by_triangles
+from sfm_shapefit.refinement.posterior import TriangleEvidence, weigh_by_triangles
 from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.splitting.lud import solve_lud
@@ -123,12 +123,15 @@ def _median_distance(t: FloatArray, onto: FloatArray) -> float:
     return float(np.median(np.linalg.norm(fitted - onto, axis=1)))
 
 
-def find_fold(graph: ViewGraph, inliers: BoolArray) -> SecondConfiguration | None:
-    """Return what triangles say of the pairs that a placement rejects, where that is a fold."""
+def find_fold(
+    graph: ViewGraph, inliers: BoolArray, triangles: TriangleEvidence | None = None
+) -> SecondConfiguration | None:
+    """Return what triangles, weighed if None, say of the pairs that a placement rejects; None if no fold."""
     rejected = np.flatnonzero(~inliers)
     if len(rejected) <= _MANY_REJECTED * len(inliers):
         return None
-    closing = rejected[weigh_by_triangles(graph).log_odds[rejected] > 0.0]
+    triangles = weigh_by_triangles(graph) if triangles is None else triangles
+    closing = rejected[triangles.log_odds[rejected] > 0.0]
     if len(closing) <= _MOST * len(rejected):
         return None
     cameras, against = np.unique(graph.edges[closing]), int(inliers.sum())

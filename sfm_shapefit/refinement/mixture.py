@@ -73,16 +73,15 @@ _LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; e^4, twice 
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
 _DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
-_LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.01  # nats; a smaller change of the bound is none
+_LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.003  # nats; a smaller change of the bound is none
 _SMALL_STEP = 1e-3  # nats that a step promises; below, it is taken unseen, since rounding may hide the gain
-_MET = 0.1  # levels; a descent that passes all right pairs of another so closely ends where that did
+_MET = 0.1  # levels; a descent that has all baselines of another, so closely, ends where that did
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
 _FAR = 3.0  # typical levels, at a node's mean log length; a consensus that moves none so far gains nothing
 _ROUND_GAIN = 1.0  # nats; such a descent that gains less is the last
 _TYPICAL = 0.84  # standard score of a log level; the level that four of five have at most
 _NEGLIGIBLE = 120.0  # squared standard scores; the density is nothing beside that of higher levels
 _UNKNOWN = 1e-6  # probability of being right; a direction of less has the usual variance
-_RIGHT = 0.5  # probability; directions of more are right
 _MOST_LEVERAGE = 0.9  # share of a residual's variance; nothing but the pair holds such a camera
 _WEIGH_ROUNDS = 3  # rounds of share and variances at locations that stay; they settle in as many
 _TINY = float(np.finfo(np.float64).tiny)
@@ -270,10 +269,10 @@ class Mixture:
         return None if last is None else _Descent(path, self._judge(*last))
 
     def _meet(self, other: _Descent, step: int, at: _Residuals, level: float) -> bool:
-        """Return whether all right pairs are where another descent had them after as many steps."""
+        """Return whether all baselines are as another descent had them after as many steps."""
         there = other.path[step] if step < len(other.path) else other.end.locations
         apart = np.linalg.norm(differences(at.locations - there, self._graph.edges), axis=1)
-        return bool(np.all((apart < _MET * level * at.lengths)[other.end.posterior > _RIGHT]))
+        return bool(np.all(apart < _MET * level * at.lengths))
 
     def _draw_in(self, t: FloatArray) -> FloatArray:
         """Return locations with the nodes whose pairs are very long amid their neighbors.

@@ -71,6 +71,8 @@ class Reweighted:
     """The optimum refined in angles, at these weights; None where the optimum itself has more evidence."""
     mixture: ResidualMixture
     """How likely either makes all directions."""
+    triangles: TriangleEvidence | None = None
+    """What triangles say of the pairs, where the weights are theirs."""
 
     @property
     def locations(self) -> FloatArray:
@@ -107,12 +109,11 @@ def solve_reweighted(
 def solve_at_triangles(measured: MeasuredGraph, options: SolverOptions) -> Reweighted:
     """Return ShapeFit at the posteriors that the triangles of a graph give its pairs, certified."""
     graph = measured.graph
-    weighted = graph.with_weights(
-        graph.weights * np.maximum(weigh_by_triangles(graph).posterior, _LEAST_WEIGHT)
-    )
+    triangles = weigh_by_triangles(graph)
+    weighted = graph.with_weights(graph.weights * np.maximum(triangles.posterior, _LEAST_WEIGHT))
     solved = solve(weighted, options, groups=measured.groups)
     mixture = fit_mixture(measured, solved.locations)
-    return Reweighted(graph=weighted, solved=solved, refined=None, mixture=mixture)
+    return Reweighted(graph=weighted, solved=solved, refined=None, mixture=mixture, triangles=triangles)
 
 
 def can_be_reweighted(measured: MeasuredGraph) -> bool:

@@ -34,6 +34,7 @@ from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture, own_variances
 from sfm_shapefit.refinement.mixture import Mixture, MixtureEnd
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.posterior import TriangleEvidence
 from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.refinement.reweighted import (
     POOR_SHARE,
@@ -129,7 +130,9 @@ class RefinedPlacement:
     variances: FloatArray | None = None
     """(m,) variance per axis of each direction if it is right, rad^2; None where one level serves all."""
     rivals: tuple[Rival, ...] = ()
-    """Where other starts led to under a mixture, most evidence first; often to the place of the kept one."""
+    """Where other starts led to under a mixture, most evidence first; often near the kept one."""
+    triangles: TriangleEvidence | None = None
+    """What triangles say of the directions; None where nothing asked them, or they chose weights alone."""
 
     @property
     def collapsed(self) -> bool:
@@ -209,6 +212,7 @@ def refine_starts(
         reweighted=kept.reweighted,
         variances=kept.variances,
         rivals=kept.rivals,
+        triangles=kept.triangles,
     )
 
 
@@ -224,6 +228,7 @@ class _Kept(NamedTuple):
     reweighted: Reweighted | None
     variances: FloatArray | None = None
     rivals: tuple[Rival, ...] = ()
+    triangles: TriangleEvidence | None = None
 
 
 def _find_best_fit(problem: _Problem, options: PlacementOptions) -> _Kept:
@@ -300,7 +305,18 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
     if best.reweighted is not None:
         reason += f"; {_say_certified(best.reweighted)}"
     costs = {found.name: -found.end.bound for found in candidates}
-    return _Kept(start, reason, costs, levels, end.posterior, best.reweighted, end.variances, tuple(rivals))
+    asked = (found.reweighted.triangles for found in candidates if found.reweighted is not None)
+    return _Kept(
+        start=start,
+        reason=reason,
+        costs=costs,
+        levels=levels,
+        posterior=end.posterior,
+        reweighted=best.reweighted,
+        variances=end.variances,
+        rivals=tuple(rivals),
+        triangles=next(asked, None),
+    )
 
 
 def _compare_ends(model: Mixture, candidates: list[_Candidate]) -> tuple[_Candidate, MixtureEnd, list[Rival]]:
