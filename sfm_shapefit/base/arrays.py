@@ -8,6 +8,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from sfm_shapefit.base.errors import InputError
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -17,6 +19,17 @@ _began = [230_000_000]  # bytes of the process when its run began; the program a
 
 AnyArray = TypeVar("AnyArray", bound=npt.NDArray[Any])
 Columns = TypeVar("Columns", bound=NamedTuple)
+
+
+def real_numbers(requirement: str, values: npt.ArrayLike) -> FloatArray:
+    """Return values as float64, or raise InputError with what is required of them."""
+    try:
+        given = np.asarray(values)
+        if np.iscomplexobj(given):
+            raise InputError(requirement)
+        return np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(requirement) from error
 
 
 def sum_by(labels: IntArray, rows: FloatArray, count: int) -> FloatArray:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen, real_numbers
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.laplacian.operators import adjacency
@@ -20,6 +20,7 @@ from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import EliminationTree
 
 _UNIT_NORM_TOLERANCE = 1e-6  # absolute; a direction printed with 7 digits passes, a wrong one does not
+_WEIGHTS = (1e-60, 1e60)  # least and largest; products of three, over all pairs, stay finite and not 0
 # Rounding of a norm; dividing by 1 to rounding only changes last bits.
 _ROUNDING = 8.0 * np.finfo(np.float64).eps
 
@@ -142,12 +143,12 @@ def _check_arrays(
         raise InputError(f"edges have shape {raw_edges.shape}; give one row (i, j) per pair, shape (m, 2)")
     # By rows, whatever the caller has them by: kernels are compiled anew for every other layout.
     i = raw_edges.astype(np.int64, order="C").reshape(-1, 2)
-    v = np.array(directions, dtype=np.float64, order="C")
+    v = np.array(real_numbers("directions must be numbers of shape (m, d)", directions), order="C")
     if v.ndim != 2 or len(v) != len(i) or v.shape[1] < 2:
         raise InputError(
             f"directions have shape {v.shape} for {len(i)} edges; give one row of length d >= 2 per edge"
         )
-    w = np.ones(len(i)) if weights is None else np.array(weights, dtype=np.float64)
+    w = np.ones(len(i)) if weights is None else np.array(real_numbers("weights must be numbers", weights))
     if w.shape != (len(i),):
         raise InputError(f"weights have shape {w.shape} for {len(i)} edges; give one number per edge")
 
@@ -159,6 +160,8 @@ def _check_arrays(
         ~(np.abs(norms - 1.0) <= _UNIT_NORM_TOLERANCE), i, "has a direction that is not a finite unit vector"
     )
     _refuse(~(np.isfinite(w) & (w > 0.0)), i, "has a weight that is not finite and positive; remove it")
+    least, most = _WEIGHTS
+    _refuse((w < least) | (w > most), i, f"has a weight outside {least:g} to {most:g}; scale all weights")
     norms[np.abs(norms - 1.0) <= _ROUNDING] = 1.0
     return i, v / norms[:, None], w
 

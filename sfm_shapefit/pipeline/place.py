@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.base.settings import merge_options
@@ -71,8 +71,8 @@ def place(
         **overrides: single options by name: `place(graph, refine=False)`.
 
     Raises:
-        InputError: if sigma has another shape, or negative or infinite values, or if all rotations contradict
-            one another; else as `average_rotations` and `place_pieces`.
+        InputError: if sigma has another shape, negative values or such beyond pi radians, or if all rotations
+            contradict one another; else as `average_rotations` and `place_pieces`.
         UnsolvableError: as `place_pieces`.
     """
     options = merge_options(options, PlacementOptions, overrides)
@@ -121,14 +121,22 @@ def _agree(pairs: IntArray, relative: FloatArray, rotations: FloatArray, most_de
 
 def _covariances(graph: ViewGraph, sigma: npt.ArrayLike) -> FloatArray:
     """Return the covariances (m, d - 1, d - 1) of directions from these, or from standard deviations (m,)."""
-    given, m, k = np.asarray(sigma, dtype=np.float64), graph.num_edges, graph.dimension - 1
+    given = real_numbers("sigma must be numbers, NaN where they are unknown", sigma)
+    m, k = graph.num_edges, graph.dimension - 1
     if given.shape not in ((m,), (m, k, k)):
         raise InputError(
             f"sigma has shape {given.shape}; give one standard deviation, radians, for each of the {m} "
             f"directions, or covariances of shape {(m, k, k)}"
         )
-    least = given if given.ndim == 1 else np.linalg.eigvalsh(np.nan_to_num(given))
-    if np.isinf(given).any() or np.any(least < 0.0):
+    known = np.nan_to_num(given, posinf=np.inf, neginf=-np.inf)
+    if given.ndim > 1 and not np.allclose(known, known.swapaxes(1, 2)):
+        raise InputError("sigma has covariances that are not symmetric; give symmetric ones")
+    if np.any(known > (np.pi if given.ndim == 1 else np.pi**2)) and not np.isinf(known).any():
+        raise InputError(
+            "sigma has values beyond pi radians, the largest angle; give radians, and NaN where they are "
+            "unknown"
+        )
+    if np.isinf(known).any() or np.any((known if given.ndim == 1 else np.linalg.eigvalsh(known)) < 0.0):
         raise InputError(
             "sigma has negative or infinite values; give standard deviations or covariances, and NaN where "
             "they are unknown"

@@ -37,9 +37,9 @@ for that, by the variance of this posterior (Louis 1982). Standard deviations of
 small, by a factor of 1.5 for a spread of .85, so the variances of an end are enlarged by the share that is
 left, summed over all right pairs, since a single pair may curve the likelihood the other way.
 
-Sources: Louis, "Finding the observed information matrix when using the EM algorithm", JRSS B 1982; Bishop, "Pattern Recognition and Machine Learning", 2006, sections 10.1 and 10.2, for variational
-mixtures; Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020. The prior of
-lengths is our own.
+Sources: Louis, "Finding the observed information matrix when using the EM algorithm", JRSS B 1982; Bishop,
+"Pattern Recognition and Machine Learning", 2006, sections 10.1 and 10.2, for variational mixtures; Yang et
+al., "Graduated non-convexity for robust spatial perception", RA-L 2020. The prior of lengths is our own.
 """
 
 from dataclasses import dataclass
@@ -132,8 +132,8 @@ class MixtureEnd:
     posterior: FloatArray
     """(m,) probability that each direction is right."""
     variances: FloatArray
-    """(m,) variance per axis, rad^2, own part included, of an error that says as much of the locations as that
-    of each direction if it is right."""
+    """(m,) variance per axis, rad^2, own part included, of an error that says as much of the locations as
+    that of each direction if it is right."""
     levels: Levels
     """Share and noise of the right directions."""
     looseness: FloatArray

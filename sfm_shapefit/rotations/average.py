@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import connected_components
@@ -351,10 +351,7 @@ def check_pairs(
 
 def _numbers(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     """Return finite float64 numbers of a shape, or raise InputError."""
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be numbers of shape {shape}") from error
+    array = real_numbers(f"{name} must be numbers of shape {shape}", values)
     if array.shape != shape:
         raise InputError(f"{name} have shape {array.shape}; {shape[0]} pairs need {shape}")
     if not np.isfinite(array).all():

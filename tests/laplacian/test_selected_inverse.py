@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from harness.graphs import laplacian_matrix
-from sfm_shapefit.laplacian.cholesky import analyze, factorize
+from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze, factorize
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.synthetic import box_graph_problem, trajectory_graph_problem
 from tests.graph_families import random_blocks
@@ -45,3 +45,16 @@ def test_entries_are_right_where_the_factor_is_cut_into_tasks_and_single_precisi
         limit = 1e-9 * np.abs(column).max()
         np.testing.assert_allclose(found.nodes[node, 0, 0], column[node], atol=limit)
         np.testing.assert_allclose(found.edges[edges[:, 0] == node, 0, 0], column[tied[:, 1]], atol=limit)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_entries_are_the_same_to_the_bit_for_any_number_of_threads(threads):
+    edges = trajectory_graph_problem(6000, 60.0, seed=0).edges
+    plan, weights = analyze(6000, edges), random_blocks(len(edges), 2, seed=0)
+    answers = []
+    for count in (1, threads):
+        factor = allocate_factor(plan, 2, threads=count)
+        factor.refactor(weights)
+        answers.append(selected_inverse(factor, edges))
+    np.testing.assert_array_equal(answers[0].nodes, answers[1].nodes)
+    np.testing.assert_array_equal(answers[0].edges, answers[1].edges)

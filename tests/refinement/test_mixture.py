@@ -5,7 +5,7 @@ import pytest
 
 from sfm_shapefit import synthetic
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.base.geometry import fit_similarity_l1, normalized
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -205,6 +205,11 @@ def test_standard_deviations_and_covariances_say_the_same(objective, on_street):
     [
         (0.01, r"sigma has shape \(\); give one standard deviation, radians, for each of the 924"),
         (np.full(924, -0.01), "sigma has negative or infinite values"),
+        (np.full(924, 1e200), "sigma has values beyond pi radians"),
+        (np.tile(np.eye(2) * 1e300, (924, 1, 1)), "sigma has values beyond pi radians"),
+        (np.tile([[1e-2, 5e-3], [0.0, 1e-2]], (924, 1, 1)), "sigma has covariances that are not symmetric"),
+        (["sharp"] * 924, "sigma must be numbers"),
+        (np.full(924, 0.01j), "sigma must be numbers"),
         (np.full(924, np.inf), "sigma has negative or infinite values"),
         (np.tile(np.diag([1e-4, -1e-4]), (924, 1, 1)), "sigma has negative or infinite values"),
     ],
@@ -241,3 +246,26 @@ def test_the_logarithm_of_the_determinant_is_that_of_the_whole_matrix(block):
     at = np.arange(block * last, block * (last + 1))
     whole[at, at] += np.trace(whole) / len(whole)
     assert factor.log_determinant() == pytest.approx(np.linalg.slogdet(whole)[1], rel=1e-12)
+
+
+def test_standard_deviations_are_those_of_the_errors_where_pairs_differ_in_noise():
+    rng = np.random.default_rng(0)
+    squares = []
+    for seed in range(4):
+        problem = synthetic.random_graph_problem(60, 0.4, seed=seed)
+        graph = problem.view_graph
+        sigma = 0.01 * np.exp(rng.standard_normal(graph.num_edges))
+        noise = sigma[:, None] * rng.standard_normal(graph.directions.shape)
+        found = place(ViewGraph(60, graph.edges, normalized(graph.directions + noise)))
+        fit = fit_similarity_l1(found.locations, problem.locations[found.cameras], rotate=False)
+        errors = fit.apply(found.locations) - problem.locations[found.cameras]
+        squares.append(np.mean(errors**2 / np.einsum("kaa->ka", found.covariances)) / fit.scale**2)
+    # 720 coordinates; 1.4 and above where the information is that of known levels.
+    assert 0.75 < np.sqrt(np.mean(squares)) < 1.25
+
+
+def test_starts_that_lead_to_one_place_are_followed_there_once():
+    problem = synthetic.random_graph_problem(60, 0.4, sigma=0.01, q=0.3, seed=1)
+    found = place(problem.view_graph)
+    assert len(set(found.refined.costs.values())) == 1 < len(found.refined.costs)
+    assert found.refined.rivals == ()
