@@ -260,7 +260,7 @@ def test_standard_deviations_are_those_of_the_errors_where_pairs_differ_in_noise
         fit = fit_similarity_l1(found.locations, problem.locations[found.cameras], rotate=False)
         errors = fit.apply(found.locations) - problem.locations[found.cameras]
         squares.append(np.mean(errors**2 / np.einsum("kaa->ka", found.covariances)) / fit.scale**2)
-    # 720 coordinates; 1.4 and above where the information is that of known levels.
+    # 720 coordinates; 1.39 where the information is that of known levels.
     assert 0.75 < np.sqrt(np.mean(squares)) < 1.25
 
 
