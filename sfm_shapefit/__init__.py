@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     )
     from sfm_shapefit.facts.result import LocateResult
     from sfm_shapefit.files.colmap.quiet import hear_pycolmap
+    from sfm_shapefit.files.options import MatchingOptions
     from sfm_shapefit.graph.viewgraph import ViewGraph
     from sfm_shapefit.judgement.options import TrustOptions
     from sfm_shapefit.pairs.options import DirectionOptions
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.join import join
     from sfm_shapefit.pipeline.locate import locate
     from sfm_shapefit.pipeline.map import map_database
+    from sfm_shapefit.pipeline.match import match_images
     from sfm_shapefit.pipeline.place import place
     from sfm_shapefit.pipeline.relative_rotations import relative_rotations
     from sfm_shapefit.pipeline.write import WriteOptions, write_result
@@ -69,6 +71,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "files.colmap.quiet": ("hear_pycolmap",),
+    "files.options": ("MatchingOptions",),
     "adjustment.options": ("AdjustmentOptions",),
     "pipeline.adjust": ("AdjustedModel", "bundle_adjust"),
     "pipeline.check": ("check",),
@@ -81,6 +84,7 @@ _HOMES = {
     "pipeline.join": ("join",),
     "pipeline.locate": ("locate",),
     "pipeline.map": ("map_database",),
+    "pipeline.match": ("match_images",),
     "pipeline.relative_rotations": ("relative_rotations",),
     "pipeline.write": ("WriteOptions", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
@@ -124,6 +128,7 @@ __all__ = [
     "LocateResult",
     "MapOptions",
     "MapResult",
+    "MatchingOptions",
     "NodeOptions",
     "Placement",
     "PlacementOptions",
@@ -151,6 +156,7 @@ __all__ = [
     "join",
     "locate",
     "map_database",
+    "match_images",
     "place",
     "relative_rotations",
     "solve",

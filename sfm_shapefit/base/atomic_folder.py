@@ -33,20 +33,27 @@ MAP_MARKER = "map.json"
 """The file by which an output folder of `map` is recognized."""
 
 
-def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()) -> None:
+def check_output(
+    out: Path | str,
+    *,
+    overwrite: bool = False,
+    protect: Sequence[Path | str] = (),
+    kept: Sequence[str] = (),
+) -> None:
     """Raise InputError, one sentence that says what to do instead, if an output folder may not be written.
 
     Args:
         out: the folder to be made; missing parents are fine.
         overwrite: accept an earlier output too (it has a marker); an empty folder is accepted anyway.
         protect: files and folders, such as the input, that `out` may neither be nor contain.
+        kept: names of files that `out` may hold already, which the new folder has too.
     """
     folder = Path(out)
     _refuse_protected(folder, protect)
     if folder.is_symlink():
         raise InputError(f"{folder} is a symbolic link; give the folder that it stands for")
     if folder.exists():
-        _refuse_existing(folder, overwrite=overwrite)
+        _refuse_existing(folder, overwrite=overwrite, kept=kept)
     parents = Path(os.path.abspath(folder)).parents
     parent = next(parent for parent in parents if os.path.lexists(parent))
     if not parent.is_dir():
@@ -57,10 +64,14 @@ def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[
 
 @contextmanager
 def claimed_output(
-    out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()
+    out: Path | str,
+    *,
+    overwrite: bool = False,
+    protect: Sequence[Path | str] = (),
+    kept: Sequence[str] = (),
 ) -> Iterator[None]:
     """Hold the place of an output folder, as `check_output` has it, while `atomic_folder` inside writes."""
-    check_output(out, overwrite=overwrite, protect=protect)
+    check_output(out, overwrite=overwrite, protect=protect, kept=kept)
     with _claim(Path(os.path.abspath(out))) as private:
         token = _claimed.set(private)
         try:
@@ -71,7 +82,11 @@ def claimed_output(
 
 @contextmanager
 def atomic_folder(
-    out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()
+    out: Path | str,
+    *,
+    overwrite: bool = False,
+    protect: Sequence[Path | str] = (),
+    kept: Sequence[str] = (),
 ) -> Iterator[Path]:
     """Yield a new empty folder that becomes `out` when the block ends, and vanishes if it raises.
 
@@ -82,7 +97,7 @@ def atomic_folder(
             disk: any OSError of the block), or if `out` came into being meanwhile. Any other exception,
             KeyboardInterrupt included, passes through. Neither `out` nor its parents have changed then.
     """
-    check_output(out, overwrite=overwrite, protect=protect)
+    check_output(out, overwrite=overwrite, protect=protect, kept=kept)
     folder = Path(os.path.abspath(out))
     try:
         with _claim(folder) as private:
@@ -90,7 +105,9 @@ def atomic_folder(
             try:
                 partial.mkdir()
                 yield partial
-                _move_into_place(partial, folder, overwrite=overwrite)
+                for name in kept:
+                    _copy(folder / name, partial / name)
+                _move_into_place(partial, folder, overwrite=overwrite, kept=kept)
             except InputError as error:  # raised by a writer, which names the place where it writes
                 raise InputError(str(error).replace(str(partial), str(out))) from error
             finally:
@@ -262,12 +279,22 @@ def _refuse_protected(folder: Path, protect: Sequence[Path | str]) -> None:
             )
 
 
-def _refuse_existing(folder: Path, *, overwrite: bool) -> None:
-    """Refuse whatever exists at `folder`, except one that is empty or may be overwritten."""
+def _copy(file: Path, target: Path) -> None:
+    """Put a file, if there is one, at another place too: by a link, or where none can be made by a copy."""
+    if not file.is_file():
+        return
+    try:
+        os.link(file, target)
+    except OSError:
+        shutil.copy2(file, target)
+
+
+def _refuse_existing(folder: Path, *, overwrite: bool, kept: Sequence[str] = ()) -> None:
+    """Refuse whatever exists at `folder`, unless it has files to keep alone, or may be overwritten."""
     if not folder.is_dir():
         raise InputError(f"{folder} is a file; give the name of a new folder")
     try:
-        is_empty = not any(folder.iterdir())
+        is_empty = all(path.name in kept for path in folder.iterdir())
     except OSError as error:
         raise InputError(f"{folder} cannot be read ({error.strerror}); choose another folder") from error
     if is_empty:  # users of COLMAP make it first
@@ -287,7 +314,7 @@ _AT_FDCWD, _NO_REPLACE, _EXCHANGE = -100, 1, 2  # arguments of renameat2; see Li
 _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP)
 
 
-def _move_into_place(partial: Path, folder: Path, *, overwrite: bool) -> None:
+def _move_into_place(partial: Path, folder: Path, *, overwrite: bool, kept: Sequence[str] = ()) -> None:
     """Rename `partial` to `folder`; an old folder is where `partial` was afterwards, or as it was before."""
     if not os.path.lexists(folder):
         try:
@@ -296,7 +323,7 @@ def _move_into_place(partial: Path, folder: Path, *, overwrite: bool) -> None:
         except FileExistsError:
             raise InputError(f"{folder} exists already, made by another program meanwhile") from None
         return
-    _refuse_existing(folder, overwrite=overwrite)
+    _refuse_existing(folder, overwrite=overwrite, kept=kept)
     if _renamed_at_once(partial, folder, _EXCHANGE):
         return
     old = partial.with_name(f"{partial.name}.old")

@@ -56,12 +56,13 @@ _received: list[int] = []
 
 
 @contextmanager
-def report_errors(out: Path | None = None) -> Iterator[None]:
+def report_errors(out: Path | None = None, begun: Path | None = None) -> Iterator[None]:
     """Turn every known error into one sentence on stderr and its exit code.
 
     Args:
         out: the folder or file that the block makes, in one step. An interrupt after that step finds another
             folder there than before, also where the output replaces one.
+        begun: a file with which the same command goes on after an interrupt.
     """
     before = _identity(out)
     try:
@@ -76,10 +77,10 @@ def report_errors(out: Path | None = None) -> Iterator[None]:
         # Native code that a signal interrupts may turn the interrupt into an error of its own.
         if isinstance(error, KeyboardInterrupt) or _received:
             is_made = _identity(out) not in (None, before)
-            _fail(
-                f"interrupted; {'the output is complete' if is_made else 'nothing was written'}",
-                EXIT_INTERRUPTED,
-            )
+            state = "the output is complete" if is_made else "nothing was written"
+            if not is_made and begun is not None and begun.is_file():
+                state = f"the same command goes on with {begun}"
+            _fail(f"interrupted; {state}", EXIT_INTERRUPTED)
         if isinstance(error, UnsolvableError):
             _fail(str(error), EXIT_UNSOLVABLE)
         if isinstance(error, MissingExtraError):

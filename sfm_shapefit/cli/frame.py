@@ -24,6 +24,7 @@ from sfm_shapefit.cli.console import (
     show_progress,
 )
 from sfm_shapefit.cli.flags import OutputFlags, read_options
+from sfm_shapefit.files.options import MADE_FIRST
 
 if TYPE_CHECKING:
     from sfm_shapefit.base.kernel_cache import CompileTime
@@ -136,14 +137,16 @@ def command_run(
     target: Path,
     inputs: Sequence[Path | None],
     order: str = "MODEL OUT",
+    begun: Path | None = None,
 ) -> Iterator[Run[S]]:
     """Run a command that makes OUT: errors become one sentence and an exit code, and OUT is whole or absent.
 
     The first input is that which stands before OUT, `order` the names of both. Flags of `settings` and of
-    `OutputFlags` are None where the user says nothing. Inputs stay as they are.
+    `OutputFlags` are None where the user says nothing. Inputs stay as they are. `begun` is the database that
+    the command makes in OUT first, with which an interrupted run is gone on.
     """
     started = time.perf_counter()
-    with report_errors(target):
+    with report_errors(target if begun is None else target / "map.json", begun):
         from sfm_shapefit.base.atomic_folder import claimed_output
         from sfm_shapefit.files.model_folder import refuse_no_model
 
@@ -163,7 +166,8 @@ def command_run(
             refuse_swapped(inputs[0], target, order)
         if order.startswith("MODEL"):
             refuse_no_model(inputs[0])
-        with claimed_output(target, overwrite=flags.overwrite, protect=run.protect):
+        kept = () if begun is None else MADE_FIRST
+        with claimed_output(target, overwrite=flags.overwrite, protect=run.protect, kept=kept):
             from sfm_shapefit.base.kernel_cache import measure_compilation
             from sfm_shapefit.files.colmap.quiet import hear_pycolmap
 

@@ -1,10 +1,12 @@
-"""`sfm-shapefit map DATABASE OUT`."""
+"""`sfm-shapefit map DATABASE OUT`, and `map IMAGES OUT`, which makes the database first."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from sfm_shapefit.base.settings import homes_of
 from sfm_shapefit.cli.flags import (
     ExecutorName,
     GroupedCommand,
@@ -14,11 +16,13 @@ from sfm_shapefit.cli.flags import (
     PriorsFile,
     flags_of,
     one_path,
+    read_options,
     takes,
 )
-from sfm_shapefit.cli.frame import command_run
+from sfm_shapefit.cli.frame import Run, command_run
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.options import MapOptions
+from sfm_shapefit.files.options import MatchingOptions
 
 _FLAGS = (
     *("control_points", "known_distance", "gravity", "without", "intrinsics", "rigs", "adjust", "scale"),
@@ -31,12 +35,15 @@ _FLAGS = (
     "map",
     cls=GroupedCommand,
     short_help="Make models from the matches of a COLMAP database.",
-    epilog="Example: sfm-shapefit map database.db out --images images",
+    epilog="Examples: sfm-shapefit map images out; sfm-shapefit map database.db out --images images",
 )
-@takes(flags_of(MapOptions, *_FLAGS), flags_of(OutputFlags), settings=MapOptions)
+@takes(flags_of(MapOptions, *_FLAGS), flags_of(MatchingOptions), flags_of(OutputFlags), settings=MapOptions)
 def map_command(
     database: Annotated[
-        Path | None, typer.Argument(metavar="DATABASE", help="COLMAP database with verified matches.")
+        Path | None,
+        typer.Argument(
+            metavar="DATABASE", help="COLMAP database with verified matches, or a folder of images to match."
+        ),
     ] = None,
     out: OutArgument = None,
     *,
@@ -46,13 +53,45 @@ def map_command(
     executor: ExecutorName = "serial",
     **given: Any,
 ) -> None:
-    """Make models from the matches of DATABASE; write them to OUT/0, OUT/1, ..., the largest first."""
+    """Make models from the matches of DATABASE; write them to OUT/0, OUT/1, ..., the largest first.
+
+    Where DATABASE is a folder of images, OUT/database.db is made of them first, by COLMAP's features and
+    matcher.
+    """
     source = one_path(database, database_path, "DATABASE")
     target = one_path(out, output_path, "OUT")
-    with command_run(MapOptions, given, target, [source, priors], "DATABASE OUT") as run:
+    made = _database_to_make(source, target, given)
+    with command_run(MapOptions, given, target, [source, priors], "DATABASE OUT", made) as run:
         from sfm_shapefit.pipeline.execution import open_executor
         from sfm_shapefit.pipeline.map import map_database
 
+        if made is not None:
+            _match(source, made, given, run)
         with open_executor(executor, run.options.placement.solver.num_threads()) as workers:
-            found = map_database(source, run.options, progress=run.progress, priors=priors, executor=workers)
-        run.finish(found, source, target)
+            found = map_database(
+                made or source, run.options, progress=run.progress, priors=priors, executor=workers
+            )
+        run.finish(found if made is None else replace(found, images=source), source, target)
+
+
+def _database_to_make(source: Path, target: Path, given: dict[str, Any]) -> Path | None:
+    """Return the database to be made of a folder of images; None where the source is, or has, one."""
+    from sfm_shapefit.files.colmap.sqlite_file import DATABASE_NAMES, database_beside
+
+    if source.is_dir() and database_beside(source) is None:
+        return target / DATABASE_NAMES[0]
+    if told := [name for name in homes_of(MatchingOptions) if given.get(name) is not None]:
+        raise typer.BadParameter(
+            f"--{told[0].replace('_', '-')} is for a folder of images, but {source} is a database already"
+        )
+    return None
+
+
+def _match(images: Path, database: Path, given: dict[str, Any], run: Run[MapOptions]) -> None:
+    """Make the database, and let the report have the images."""
+    from sfm_shapefit.pipeline.match import match_images
+
+    matching = read_options(MatchingOptions, given)
+    threads = run.options.placement.solver.threads
+    match_images(images, database, matching, threads=threads, progress=run.progress)
+    run.flags = replace(run.flags, images=run.flags.images or str(images))

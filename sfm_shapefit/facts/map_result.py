@@ -128,6 +128,8 @@ class MapResult(Written):
     """Models that were joined, in one world; each stands in `models` by itself too."""
     warnings: tuple[str, ...]
     """What the user should know beyond the warnings of each model."""
+    images: Path | None = None
+    """Folder of the photographs of which the database was made, in the folder of the result."""
 
     @property
     def num_placed(self) -> int:

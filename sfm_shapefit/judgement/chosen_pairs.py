@@ -78,6 +78,20 @@ def choose_pairs(images: Images, shared: Shared, descriptors: Sequence[IntArray]
     return ChosenPairs(asked[pairs[order]], tuple(reasons[order].tolist()))
 
 
+def alike_pairs(descriptors: Sequence[IntArray], most: int) -> IntArray:
+    """Return the pairs (k, 2), i < j, of each picture and those `most` that look most like it.
+
+    Args:
+        descriptors: (k, 128) of each picture, 0 to 255; a picture without any is in no pair.
+        most: pairs of a picture that it has itself; others may have it too.
+    """
+    asked = np.flatnonzero([len(some) > 0 for some in descriptors])
+    if len(asked) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    pairs = _most_alike(_signatures([descriptors[k] for k in asked.tolist()]), most).pairs()
+    return asked[np.unique(np.sort(pairs, axis=1), axis=0)]
+
+
 class _Ranked(NamedTuple):
     """The others that come first by some cost, for each of n images."""
 
@@ -167,10 +181,10 @@ def _signatures(descriptors: Sequence[IntArray]) -> IntArray:
     return np.array(signatures, dtype=np.int8).astype(np.int64)
 
 
-def _most_alike(signatures: IntArray) -> _Ranked:
+def _most_alike(signatures: IntArray, most: int = _LOOKED_AT) -> _Ranked:
     """Return the images whose pictures are most alike; costs are negative likeness."""
     every = signatures.astype(np.float32)  # products of whole numbers below 2^24, so that sums are exact
-    count = min(_LOOKED_AT, len(every) - 1)
+    count = min(most, len(every) - 1)
     others, costs = [], []
     for begin in range(0, len(every), _ROWS):
         likeness = every[begin : begin + _ROWS] @ every.T

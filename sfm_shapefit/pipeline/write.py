@@ -25,6 +25,7 @@ from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import covariance_of, covariances_text, own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
 from sfm_shapefit.files.colmap.seed import write_model
+from sfm_shapefit.files.options import MADE_FIRST
 
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
@@ -72,7 +73,9 @@ def write_result(
     """
     options = merge_options(options, WriteOptions, overrides)
     protect = [*_inputs_of(found), *options.protect]
-    with atomic_folder(out, overwrite=options.overwrite, protect=protect) as folder:
+    made = isinstance(found, MapResult) and found.images is not None
+    kept = MADE_FIRST if made else ()
+    with atomic_folder(out, overwrite=options.overwrite, protect=protect, kept=kept) as folder:
         if isinstance(found, MapResult):
             models = {str(number): model.located for number, model in enumerate(found.models)}
             for name, one in (models | {joined.folder: joined for joined in found.joined}).items():
@@ -87,6 +90,8 @@ def _inputs_of(found: Any) -> list[Path]:
     """Return the files and folders that a result was made of."""
     if isinstance(found, LocateResult):
         return [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
+    if isinstance(found, MapResult) and found.images is not None:
+        return [found.images]
     if isinstance(found, MapResult | GraphResult):
         return [found.database if isinstance(found, MapResult) else found.path]
     read = found.facts.inputs  # such are models that were joined or checked

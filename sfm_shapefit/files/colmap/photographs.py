@@ -1,0 +1,325 @@
+"""A COLMAP database of photographs: images and lenses, features, matches and verified pairs, by pycolmap.
+
+Images and lenses are written first, in the order of their names, so that ids do not depend on which thread
+ends first. What the database has already is not made again: a run that was interrupted goes on.
+"""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.executors import Advance
+from sfm_shapefit.base.paths import refuse_no_folder
+from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.files.colmap.images import bytes_of_name, name_of
+from sfm_shapefit.files.colmap.quiet import quiet_log
+from sfm_shapefit.files.options import MatchingOptions
+
+_READABLE = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+_OTHERS = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".mp4", ".mov", ".insv"})
+"""Suffixes of photographs and videos that pycolmap does not read."""
+_DEFAULT_FOCAL = 1.2  # picture widths; COLMAP's guess where the EXIF data have no focal length
+_BLOCK = 10  # images of a block; the pairs of two blocks are written together, a few seconds' work
+_POLL_S = 0.5  # seconds between two looks at how far the database is; each asks for every image
+_SEED = 0  # seed of the samples that verify a pair; any will do, if it is always the same
+
+
+def find_photographs(folder: Path) -> list[str]:
+    """Return the names of the images in a folder and those below it, as COLMAP has them, in their order.
+
+    Raises:
+        InputError: if it is no folder, or holds fewer than two images.
+    """
+    refuse_no_folder(folder)
+    names, others = [], Counter[str]()
+    for place, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for file in files:
+            suffix = Path(file).suffix.lower()
+            if suffix in _READABLE and not file.startswith("."):
+                names.append(Path(place, file).relative_to(folder).as_posix())
+            elif suffix in _OTHERS:
+                others[suffix] += 1
+    if len(names) < 2:
+        found = "no image" if not names else f"only {names[0]}"
+        unread = f" and {first_of([f'{n} {suffix}' for suffix, n in others.items()])}" if others else ""
+        advice = "; convert these to .jpg first" if others else "; give a folder of two images or more"
+        raise InputError(f"{folder} holds {found}{unread}{advice}")
+    return sorted(names)
+
+
+class _Picture(NamedTuple):
+    """What decides the lens of an image, and where it was taken."""
+
+    width: int
+    height: int
+    device: str | None
+    """Maker and model as the EXIF data have them."""
+    focal: float | None
+    """Pixels, by the EXIF data."""
+    position: tuple[float, float, float] | None
+    """Latitude, longitude, altitude (NaN if it has none)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotographDatabase:
+    """A database in the making, of the images of a folder."""
+
+    folder: Path
+    database: Path
+    names: Sequence[str]
+    options: MatchingOptions
+    threads: int
+
+    def write_images(self, advance: Advance) -> list[str]:
+        """Write images, lenses and positions that the database lacks; return the names that cannot be read.
+
+        Raises:
+            InputError: if the database has images that the folder lacks.
+        """
+        known = set(self.known_names())
+        if strange := sorted(known - set(self.names)):
+            raise InputError(
+                f"{self.database} has images that {self.folder} lacks, such as {strange[0]}; "
+                "remove it, or choose another OUT"
+            )
+        missing = [name for name in self.names if name not in known]
+        unreadable = []
+        with quiet_log(), pycolmap.Database.open(self.database) as database:
+            lenses = _Lenses(self.options, database)
+            with ThreadPoolExecutor(self.threads) as pool, pycolmap.DatabaseTransaction(database):
+                for k, picture in enumerate(pool.map(lambda name: _read(self.folder / name), missing)):
+                    if picture is None:
+                        unreadable.append(missing[k])
+                    else:
+                        _write_image(database, missing[k], lenses.lens_of(missing[k], picture), picture)
+                    advance(k + 1, len(missing))
+        return unreadable
+
+    def known_names(self) -> list[str]:
+        """Return the names of the images of the database by their ids; none where it does not exist."""
+        if not self.database.exists():
+            return []
+        with quiet_log(), pycolmap.Database.open(self.database) as database:
+            return [name_of(image) for image in _images_of(database)]
+
+    def detect(self, advance: Advance) -> None:
+        """Write features of the images that have none."""
+        with quiet_log(), pycolmap.Database.open(self.database) as database:
+            images = _images_of(database)
+            missing = [name_of(image) for image in images if not database.exists_descriptors(image.image_id)]
+        if not missing:
+            return
+        told, reader = self.options, pycolmap.ImageReaderOptions()
+        reader.camera_model = told.camera_model
+        if told.mask_path:
+            reader.mask_path = told.mask_path
+        extraction = pycolmap.FeatureExtractionOptions(
+            max_image_size=told.max_image_size, num_threads=self.threads
+        )
+        extraction.sift.max_num_features = told.max_num_features
+
+        def call(token: Any) -> None:
+            pycolmap.extract_features(
+                self.database,
+                self.folder,
+                [bytes_of_name(name) for name in missing],  # type: ignore[misc]
+                reader_options=reader,
+                extraction_options=extraction,
+                cancellation_token=token,
+            )
+
+        def count(database: pycolmap.Database) -> int:
+            return sum(database.exists_descriptors(image.image_id) for image in images)
+
+        self._watch(call, count, len(images), advance)
+
+    def descriptors(self, most: int) -> list[IntArray]:
+        """Return the SIFT descriptors (k, 128) of each image, those of its largest features."""
+        with quiet_log(), pycolmap.Database.open(self.database) as database:
+            return [
+                database.read_descriptors(image.image_id).data[:most].astype(np.int64)
+                if database.exists_descriptors(image.image_id)
+                else np.zeros((0, 128), dtype=np.int64)
+                for image in _images_of(database)
+            ]
+
+    def match_exhaustively(self, advance: Advance) -> None:
+        """Match and verify all pairs that are not yet matched."""
+        pairing = pycolmap.ExhaustivePairingOptions(block_size=_BLOCK)
+        count = len(self.names)
+        self._match(pycolmap.match_exhaustive, pairing, count * (count - 1) // 2, advance)
+
+    def match_sequentially(self, advance: Advance) -> None:
+        """Match and verify images near each other in the order of their names, that are not yet matched."""
+        overlap, count = self.options.overlap, len(self.names)
+        pairing = pycolmap.SequentialPairingOptions(overlap=overlap, quadratic_overlap=True)
+        lags = {*range(1, overlap + 1), *(2**k for k in range(overlap))}
+        total = sum(max(count - lag, 0) for lag in lags)
+        self._match(pycolmap.match_sequential, pairing, total, advance)
+
+    def match_pairs(self, pairs: IntArray, advance: Advance) -> None:
+        """Match and verify pairs (k, 2) of images, as rows of `known_names`, that are not yet matched.
+
+        Raises:
+            InputError: if a name has a space, which COLMAP's lists of pairs cannot hold.
+        """
+        names = self.known_names()
+        if spaced := [name for name in names if len(name.split()) != 1]:
+            raise InputError(
+                f"{counted(len(spaced), 'name')} such as {spaced[0]!r} have spaces, which COLMAP's lists of "
+                "pairs cannot hold; rename the images, or give pairing=exhaustive"
+            )
+        listed = self.database.with_name(f"{self.database.name}.pairs.txt")
+        lines = [f"{names[i]} {names[j]}\n" for i, j in pairs.tolist()]
+        listed.write_bytes(b"".join(map(os.fsencode, lines)))
+        try:
+            pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+            self._match(pycolmap.match_image_pairs, pairing, len(pairs), advance)
+        finally:
+            listed.unlink()
+
+    def _match(self, how: Callable[..., None], pairing: Any, total: int, advance: Advance) -> None:
+        matching = pycolmap.FeatureMatchingOptions(num_threads=self.threads)
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = _SEED
+
+        def call(token: Any) -> None:
+            how(self.database, matching, pairing, verification, cancellation_token=token)
+
+        self._watch(call, pycolmap.Database.num_verified_image_pairs, total, advance)
+
+    def _watch(
+        self,
+        call: Callable[[Any], None],
+        count: Callable[[pycolmap.Database], int],
+        total: int,
+        advance: Advance,
+    ) -> None:
+        """Run a call of pycolmap, say how far the database is, and stop the call where that is interrupted.
+
+        The database is looked at by pycolmap too: where another copy of SQLite closes a file in the same
+        process, the locks of this one are gone, and the file is damaged.
+        """
+        token = pycolmap.CancellationToken()
+        with quiet_log(), ThreadPoolExecutor(1) as pool, pycolmap.Database.open(self.database) as database:
+            future = pool.submit(call, token)
+            try:
+                while not wait([future], _POLL_S).done:
+                    advance(min(count(database), total), total)
+            except BaseException:
+                token.cancel()
+                raise
+            future.result()
+
+
+def _images_of(database: pycolmap.Database) -> list[pycolmap.Image]:
+    return sorted(database.read_all_images(), key=lambda image: image.image_id)
+
+
+@dataclass(slots=True)
+class _Lenses:
+    """The lenses of a database in the making."""
+
+    options: MatchingOptions
+    database: pycolmap.Database
+    known: dict[Hashable, pycolmap.Camera] = field(default_factory=dict)
+
+    def lens_of(self, name: str, picture: _Picture) -> pycolmap.Camera:
+        """Return the lens of an image, which is written with a rig of its own if it is new."""
+        key = self._key(name, picture)
+        if key not in self.known:
+            self.known[key] = self._write(picture)
+        return self.known[key]
+
+    def _key(self, name: str, picture: _Picture) -> Hashable:
+        """Return what images of one lens have in common; images of two sizes never share one."""
+        mode, size, folder = (
+            self.options.camera_mode,
+            (picture.width, picture.height),
+            name.rpartition("/")[0],
+        )
+        if mode == "per-image":
+            return name
+        if mode == "single":
+            return size
+        is_known = mode == "auto" and picture.device is not None
+        return (*size, picture.device, picture.focal) if is_known else (*size, folder, picture.focal)
+
+    def _write(self, picture: _Picture) -> pycolmap.Camera:
+        guess = _DEFAULT_FOCAL * max(picture.width, picture.height)
+        focal, told = picture.focal or guess, self.options.camera_params
+        size = picture.width, picture.height
+        camera = pycolmap.Camera.create_from_model_name(0, self.options.camera_model, focal, *size)
+        if told:
+            camera.params = _numbers(told, len(camera.params))
+        camera.has_prior_focal_length = bool(told) or picture.focal is not None
+        camera.camera_id = self.database.write_camera(camera)
+        rig = pycolmap.Rig(rig_id=camera.camera_id)
+        rig.add_ref_sensor(camera.sensor_id)
+        self.database.write_rig(rig, use_rig_id=True)
+        return camera
+
+
+def refuse_lens(options: MatchingOptions) -> None:
+    """Refuse a camera model that COLMAP has not, or parameters that are not its.
+
+    Raises:
+        InputError: a sentence that says which there are.
+    """
+    known = sorted(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
+    if options.camera_model not in known:
+        raise InputError(f"{options.camera_model} is no camera model of COLMAP; there are {', '.join(known)}")
+    if options.camera_params:
+        camera = pycolmap.Camera.create_from_model_name(0, options.camera_model, 1.0, 2, 2)
+        _numbers(options.camera_params, len(camera.params))
+
+
+def _numbers(text: str, count: int) -> list[float]:
+    """Return the parameters of a lens."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(f"camera_params must be {count} numbers separated by commas, got {text!r}")
+    return values
+
+
+def _read(path: Path) -> _Picture | None:
+    """Read what an image says of its lens and place; None if pycolmap cannot read it."""
+    bitmap = pycolmap.Bitmap.read(path, True)
+    if bitmap is None:
+        return None
+    latitude, longitude, altitude = bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()
+    position = None
+    if latitude is not None and longitude is not None:
+        position = latitude, longitude, np.nan if altitude is None else altitude
+    return _Picture(
+        bitmap.width, bitmap.height, bitmap.exif_camera_model(), bitmap.exif_focal_length(), position
+    )
+
+
+def _write_image(database: pycolmap.Database, name: str, lens: pycolmap.Camera, picture: _Picture) -> None:
+    """Write an image, the frame that holds it alone, and its position on Earth as a prior."""
+    image = pycolmap.Image(name=bytes_of_name(name), camera_id=lens.camera_id)
+    image.image_id = database.write_image(image)
+    frame = pycolmap.Frame(rig_id=lens.camera_id)
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame)
+    if picture.position is not None:
+        prior = pycolmap.PosePrior(
+            position=np.array(picture.position),
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.WGS84,
+            corr_data_id=image.data_id,
+        )
+        database.write_pose_prior(prior)

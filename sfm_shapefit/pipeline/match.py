@@ -1,0 +1,129 @@
+"""From photographs to a COLMAP database: features, chosen pairs, matches, verified by pycolmap.
+
+images and lenses -> features -> pairs -> matches and two-view geometries
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.paths import refuse_no_folder
+from sfm_shapefit.base.record import write_json
+from sfm_shapefit.base.settings import flat_values, merge_options
+from sfm_shapefit.base.wording import first_of
+from sfm_shapefit.files.colmap.photographs import PhotographDatabase, find_photographs, refuse_lens
+from sfm_shapefit.files.options import MATCHING_FILE, MOST_EXHAUSTIVE, MatchingOptions
+from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, alike_pairs
+from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.scene.sequences import find_sequences
+from sfm_shapefit.solver.options import SolverOptions
+
+_ALIKE, _ALIKE_OF_SEQUENCE = 30, 5
+"""Alike images that each is matched with: as many as COLMAP's retrieval would be asked for, or, where those
+next in a sequence are matched too, what closes its loops."""
+
+
+def match_images(
+    images: Path | str,
+    database: Path | str,
+    options: MatchingOptions | None = None,
+    *,
+    threads: int = 0,
+    progress: Progress | None = None,
+    **overrides: Any,
+) -> Path:
+    """Make a COLMAP database of photographs, by pycolmap's features, matcher and verification.
+
+        database = sfm_shapefit.match_images("images", "work/database.db")
+        mapped = sfm_shapefit.map_database(database)
+
+    Args:
+        images: folder of the images, those in folders below it included.
+        database: file to be made. One that an interrupted call left is gone on with, and so is one to which
+            images are added.
+        options: settings, see `help(MatchingOptions)`; defaults if None.
+        threads: 0 for all cores.
+        progress: called as stages advance.
+        **overrides: single options by name: `match_images(images, database, pairing="sequential")`.
+
+    Returns:
+        the path of the database.
+
+    Raises:
+        InputError: if there are no two images that can be read, or the database is of other images.
+    """
+    options = merge_options(options, MatchingOptions, overrides)
+    clock = Clock.of(progress, SolverOptions(threads=threads))
+    folder, path = Path(images), Path(database)
+    refuse_lens(options)
+    if options.mask_path:
+        refuse_no_folder(Path(options.mask_path))
+    made = PhotographDatabase(
+        folder=folder,
+        database=path,
+        names=find_photographs(folder),
+        options=options,
+        threads=clock.threads,
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _remember(path, options)
+    with clock("images"):
+        unreadable = made.write_images(clock.advance)
+        names = made.known_names()
+    if len(names) < 2:
+        path.unlink()
+        _record_of(path).unlink()
+        raise InputError(f"{folder} has no two images that pycolmap can read; not {first_of(unreadable)}")
+    with clock("features"):
+        made.detect(clock.advance)
+    with clock("matches"):
+        _match(made, _pairing_of(names, options), clock)
+    return path
+
+
+def _record_of(database: Path) -> Path:
+    """Return the file that says how a database was made."""
+    return database.with_name(MATCHING_FILE)
+
+
+def _remember(database: Path, options: MatchingOptions) -> None:
+    """Write with which options a database is made, or see that it was begun with the same.
+
+    Raises:
+        InputError: if it was not, or by another program.
+    """
+    record, told = _record_of(database), flat_values(options)
+    if not database.exists():
+        return write_json(told, record)
+    try:
+        before = json.loads(record.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InputError(
+            f"{database} was not made of images by this program; map it as it is, or choose another place"
+        ) from None
+    if others := [f"{name}={before.get(name)!r}" for name in told if before.get(name) != told[name]]:
+        raise InputError(
+            f"{database} was begun with {', '.join(others)}; give the same options, or another place"
+        )
+    return None
+
+
+def _pairing_of(names: list[str], options: MatchingOptions) -> str:
+    """Return which pairs are matched."""
+    if options.pairing != "auto":
+        return options.pairing
+    if len(names) <= MOST_EXHAUSTIVE:
+        return "exhaustive"
+    numbered = sum(len(rows) for rows, _ in find_sequences(names))
+    return "sequential" if numbered == len(names) else "retrieval"
+
+
+def _match(made: PhotographDatabase, pairing: str, clock: Clock) -> None:
+    """Match the pairs of a kind, and those of a sequence that close its loops."""
+    if pairing == "exhaustive":
+        return made.match_exhaustively(clock.advance)
+    if pairing == "sequential":
+        made.match_sequentially(clock.advance)
+    most = _ALIKE_OF_SEQUENCE if pairing == "sequential" else _ALIKE
+    return made.match_pairs(alike_pairs(made.descriptors(NUM_DESCRIBED), most), clock.advance)
