@@ -98,7 +98,7 @@ class PieceTies:
     @property
     def pair_of(self) -> IntArray:
         """Pair of each match, (M,)."""
-        return np.repeat(np.arange(self.num_pairs), np.diff(self.matches.offsets))
+        return self.matches.list_of_rows()
 
     def subset(self, pairs: IntArray | BoolArray) -> "PieceTies":
         """Return some of the pairs."""

@@ -75,5 +75,6 @@ def names_of(tree):
 
 
 def test_no_other_private_name_is_used():
-    asked, defined = (set().union(*names) for names in zip(*(names_of(tree_of(p)) for p in MODULES), strict=True))
+    names = zip(*(names_of(tree_of(path)) for path in MODULES), strict=True)
+    asked, defined = (set().union(*sets) for sets in names)
     assert asked - defined - OF_NAMED_TUPLES - OF_OURS == {part for name in SEEN for part in name.split(".")}
