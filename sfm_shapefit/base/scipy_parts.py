@@ -45,7 +45,7 @@ def _functions(package: str, name: str, public: str) -> ModuleType:
 
 
 _special = _functions("scipy.special", "_ufuncs", "scipy.special")
-_lapack = compiled_module("scipy.linalg", "lapack")
+_lapack = _functions("scipy.linalg", "_flapack", "scipy.linalg.lapack")
 
 expit, logit, gammaln, chdtri = _special.expit, _special.logit, _special.gammaln, _special.chdtri
 dpotrf, dpotri, dpotrs, dtrtri = _lapack.dpotrf, _lapack.dpotri, _lapack.dpotrs, _lapack.dtrtri
