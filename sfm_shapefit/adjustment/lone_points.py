@@ -21,6 +21,7 @@ from sfm_shapefit.adjustment.projection import (
 from sfm_shapefit.adjustment.residuals import CHUNKS, Values, chunks_of, kernel_inputs
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.losses import CAUCHY, add_cauchy, weighed
 from sfm_shapefit.laplacian.operators import Workers
 
 # Share of a point's loss; a step that lowers it by less is its last. 1e-5 takes as long in all, 1e-2 a
@@ -30,9 +31,6 @@ _SINGULAR = 1e-9  # least pivot relative to its diagonal; a point of less stays 
 # Damping of a point's block at first, and at least after a refused step; each of these raises it a
 # hundredfold, so that one or two of the eight steps are lost where a point is curved.
 _FIRST_DAMPING, _LEAST_REFUSED, _GROWTH = 1e-8, 1e-4, 100.0
-# Below, log(1 + s) is a series of six terms; above, part of a product, whose logarithm is taken when it is
-# large. The error of either is rounding.
-_SMALL, _LARGE = 1e-3, 1e150
 
 
 def settle_points(
@@ -103,7 +101,7 @@ def _equations_of(p: int, given: Any, points: Any, out: Any) -> float:
     first, cameras, pixels, views, _, scale = given
     inverse_scale = 0.0 if scale == np.inf else 1.0 / scale
     v00, v01, v02, v11, v12, v22, g0, g1, g2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    sum_of_small, product = 0.0, 1.0
+    total, product = 0.0, 1.0
     for k in range(first[p], first[p + 1]):
         camera = cameras[k]
         x, y, z = look(views, camera, points, p)
@@ -114,7 +112,7 @@ def _equations_of(p: int, given: Any, points: Any, out: Any) -> float:
         ahead, rx, ry, a0, a1, a2, b0, b1, b2 = observe(views, camera, (x, y, z), ray, pixels, k)
         if ahead:
             square = rx * rx + ry * ry
-            w = 1.0 / (1.0 + square * inverse_scale)
+            w = weighed(CAUCHY, 1.0, square * inverse_scale)
             p0, p1, p2 = turn_to_world(views, camera, a0, a1, a2)
             q0, q1, q2 = turn_to_world(views, camera, b0, b1, b2)
             v00 += w * (p0 * p0 + q0 * q0)
@@ -126,16 +124,10 @@ def _equations_of(p: int, given: Any, points: Any, out: Any) -> float:
             g0 += w * (p0 * rx + q0 * ry)
             g1 += w * (p1 * rx + q1 * ry)
             g2 += w * (p2 * rx + q2 * ry)
-        s = square * inverse_scale
         if scale == np.inf:
-            sum_of_small += square
-        elif s < _SMALL:
-            sum_of_small += s * (1.0 - s * (1 / 2 - s * (1 / 3 - s * (1 / 4 - s * (1 / 5 - s / 6)))))
+            total += square
         else:
-            product *= 1.0 + s
-            if product > _LARGE:
-                sum_of_small += np.log(product)
-                product = 1.0
+            total, product = add_cauchy(square * inverse_scale, total, product)
     out[0], out[1], out[2], out[3], out[4], out[5] = v00, v01, v02, v11, v12, v22
     out[6], out[7], out[8] = g0, g1, g2
-    return 0.5 * sum_of_small if scale == np.inf else 0.5 * scale * (sum_of_small + np.log(product))
+    return 0.5 * total if scale == np.inf else 0.5 * scale * (total + np.log(product))

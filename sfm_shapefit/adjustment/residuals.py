@@ -36,6 +36,7 @@ from sfm_shapefit.adjustment.projection import (
 )
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.losses import weigh_residual
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.lens import NUM_VALUES
 
@@ -200,7 +201,7 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
             ahead, rx, ry, a0, a1, a2, b0, b1, b2 = observe(views, camera, point, ray, pixels, k)
             if not ahead:
                 continue
-            w, m00, m01, m11 = _weigh(rx, ry, scale, least_curvature)
+            w, m00, m01, m11 = weigh_residual(rx, ry, scale, least_curvature)
             p0, p1, p2 = turn_to_world(views, camera, a0, a1, a2)
             q0, q1, q2 = turn_to_world(views, camera, b0, b1, b2)
             wx, wy = w * rx, w * ry
@@ -304,24 +305,6 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
         blocks[p, 0], blocks[p, 1], blocks[p, 2] = v00, v01, v02
         blocks[p, 3], blocks[p, 4], blocks[p, 5] = v11, v12, v22
         point_gradients[p, 0], point_gradients[p, 1], point_gradients[p, 2] = g0, g1, g2
-
-
-@inner_kernel
-def _weigh(x: float, y: float, scale: float, least: float) -> tuple[float, float, float, float]:
-    """Return the weight of a residual in the gradient, and its 2 x 2 weight in the curvature.
-
-    The curvature along the residual is at least the share `least` of that across it.
-    """
-    if scale == np.inf:
-        return 1.0, 1.0, 0.0, 1.0
-    square, inverse_scale = x * x + y * y, 1.0 / scale
-    w = 1.0 / (1.0 + square * inverse_scale)
-    if least == 1.0:
-        return w, w, 0.0, w
-    bend = 2.0 * w * inverse_scale
-    if bend * square > 1.0 - least:
-        bend = (1.0 - least) / square
-    return w, w * (1.0 - bend * x * x), -w * bend * x * y, w * (1.0 - bend * y * y)
 
 
 @inner_kernel

@@ -164,7 +164,7 @@ class AdjustmentRun:
     def share_of_frames(self, tracks: ObservedTracks, found: TriangulatedPoints) -> FloatArray:
         """Return the share of each frame's observations of triangulated tracks that fit the points, (n,)."""
         frames = self.images.frame_of[views_of(self.images).images[tracks.cameras]]
-        track_of = np.repeat(np.arange(len(tracks.offsets) - 1), tracks.lengths())
+        track_of = tracks.list_of_rows()
         in_points, count = np.isin(track_of, found.tracks), len(self.images.frames.ids)
         fit, every = (np.bincount(frames[x], minlength=count) for x in (found.points_seen >= 0, in_points))
         return np.where(every > 0, fit / np.maximum(every, 1), 1.0)

@@ -52,6 +52,7 @@ from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import METRIC_SIGMA
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.losses import CAUCHY, weighed
 from sfm_shapefit.scene.lens import LensErrors
 
 _MOST_GROUPS = 64  # groups of neighboring points; each is one more right side for the factor
@@ -106,7 +107,7 @@ def estimate_center_errors(
     errors = reprojection_errors_px(problem)
     errors = errors[np.isfinite(errors)]
     scale = np.inf if options.loss_scale_px is None else options.loss_scale_px
-    weights = 1.0 / (1.0 + (errors / scale) ** 2)
+    weights = weighed(CAUCHY, 1.0, (errors / scale) ** 2)
     kappa = float(np.sum(weights**2) / np.sum(weights))
     redundancy = 1.0 - (3.0 * problem.num_points + 6.0 * problem.num_frames) / (2.0 * len(errors))
     noise2 = float(np.sum(weights**2 * errors**2) / (2.0 * np.sum(weights))) / max(redundancy, _REDUNDANCY)
@@ -349,7 +350,7 @@ def _pull(
             slopes = (a0, a1, a2, b0, b1, b2)
             _differentiate_by_frame(views, camera, (bx, by, bz), slopes, by_points[at], by_frames[at])
             square = residual[0] * residual[0] + residual[1] * residual[1]
-            weights[at] = 1.0 / (1.0 + square / scale)
+            weights[at] = weighed(CAUCHY, 1.0, square / scale)
             x = (pixels[k, 0] - windows[camera, 0]) / windows[camera, 2]
             y = (pixels[k, 1] - windows[camera, 1]) / windows[camera, 3]
             _write_polynomials(x, y, p_x, p_y, basis)

@@ -25,6 +25,7 @@ from sfm_shapefit.adjustment.schur import eliminate_points, step_points
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.losses import CAUCHY, loss, weighed
 from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
@@ -164,7 +165,7 @@ def frames_not_gained(before: AdjustmentProblem, after: AdjustmentProblem, loss_
 def costs_of_frames(problem: AdjustmentProblem, loss_scale_px: float) -> FloatArray:
     """Return the cost of each frame's observations (n,), px^2."""
     errors_px = np.nan_to_num(reprojection_errors_px(problem), nan=_BEHIND_PX)
-    losses = 0.5 * loss_scale_px**2 * np.log1p((errors_px / loss_scale_px) ** 2)
+    losses = 0.5 * loss_scale_px**2 * loss(CAUCHY, (errors_px / loss_scale_px) ** 2)
     return np.bincount(problem.frames_seeing(), losses, problem.num_frames).astype(np.float64)
 
 
@@ -196,7 +197,7 @@ def choose_loss_scale_px(problem: AdjustmentProblem, scales_px: Sequence[float])
     squares, left = squares[counts], left[counts]
 
     def variance(scale_px: float) -> float:
-        weights = 1.0 / (1.0 + squares / scale_px**2)
+        weights = weighed(CAUCHY, 1.0, squares / scale_px**2)
         slope = float(np.sum(left * weights**2))  # (div psi) / 2 = w - w^2 |r|^2 / c^2 = w^2
         return float(np.sum(left * weights**2 * squares)) / max(slope, 1e-300) ** 2
 

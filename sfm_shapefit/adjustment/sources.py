@@ -98,7 +98,7 @@ def links_touching(images: Images, links: Links, chosen: BoolArray) -> Links:
     """Return what some of the images (i,) see, and everything that is matched with it, however far."""
     own = chosen[views_of(images).images[links.cameras]]
     if isinstance(links, ObservedTracks):
-        track_of = np.repeat(np.arange(len(links.offsets) - 1), links.lengths())
+        track_of = links.list_of_rows()
         return links.subset(np.unique(track_of[own]))
     joined = connected_components(len(own), links.matches.astype(np.int64))
     touched = np.zeros(len(own), dtype=np.bool_)

@@ -51,6 +51,22 @@ def rows_of_parts(offsets: IntArray, chosen: IntArray) -> tuple[IntArray, IntArr
     return ends, np.repeat(offsets[chosen] - ends[:-1], counts) + np.arange(ends[-1])
 
 
+class Lists:
+    """Lists of rows of a table, one after the other: list k has the rows offsets[k]:offsets[k + 1]."""
+
+    __slots__ = ()
+    offsets: IntArray
+    """(k + 1,)"""
+
+    def lengths(self) -> IntArray:
+        """Return the number of rows of each list, (k,)."""
+        return np.diff(self.offsets)
+
+    def list_of_rows(self) -> IntArray:
+        """Return the list that each row stands in."""
+        return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
+
+
 def rows_taken(columns: Columns, rows: IntArray | BoolArray) -> Columns:
     """Return some rows of a tuple of arrays that all have the same, in that order."""
     return columns._make(column[rows] for column in columns)

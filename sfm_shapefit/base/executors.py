@@ -1,8 +1,8 @@
-"""Work shared out to any `concurrent.futures` executor, in order, and reported where a worker dies."""
+"""Work shared out among threads or to any `concurrent.futures` executor; answers come in order."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import TypeVar
 
 from sfm_shapefit.base.errors import ShapeFitError
@@ -18,6 +18,15 @@ _TASKS_AT_ONCE = 32  # tasks submitted ahead of the answers; bounds the memory t
 
 def nobody(_done: int, _total: int) -> None:
     """Hear of progress, and tell no one."""
+
+
+def in_threads(threads: int, work: Callable[[Task], Answer], tasks: Iterable[Task]) -> Iterator[Answer]:
+    """Yield what `work` makes of each task, in the order of the tasks; a single thread is the caller's."""
+    if threads <= 1:  # where memory is short, Python waits for ever for a thread that could not begin
+        yield from map(work, tasks)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(work, tasks)
 
 
 class WorkerError(ShapeFitError):

@@ -9,11 +9,10 @@ not be a constant of compiled code (numba would not cache it): `call_address` ta
 
 What compiling costs. A kernel with eight arrays takes about 0.15 s, most of it before LLVM has begun: what
 counts is the number of statements. Every kernel that calls another optimizes a copy of it again, so chains of
-calls are kept short; inner kernels are optimized where they are called, and nowhere else. An assignment of
-one array to another (`a[:] = b`), arithmetic of whole arrays and most functions of numpy bring tens of
-compilations of their own, where a loop brings none. Another type of argument is another compilation: integers
-are int64 and arrays writable, or read-only, wherever a kernel is called; a literal number has a type of its
-own.
+calls are kept short. An assignment of one array to another (`a[:] = b`), arithmetic of whole arrays and most
+functions of numpy bring tens of compilations of their own, where a loop brings none. Another type of argument
+is another compilation: integers are int64 and arrays writable, or read-only, wherever a kernel is called; a
+literal number has a type of its own.
 """
 
 import hashlib
@@ -28,11 +27,9 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils, targetconfig
 from numba.core.event import install_listener
-from numba.core.typing.templates import infer_global
-from numba.extending import get_cython_function_address, intrinsic
+from numba.extending import get_cython_function_address, intrinsic, register_jitable
 
 from sfm_shapefit.base.kernel_cache import CompileTime, KernelCache, choose_target
-from sfm_shapefit.base.kernel_code import InnerCompiler
 from sfm_shapefit.base.scipy_parts import compiled_module
 
 choose_target()
@@ -58,9 +55,6 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 # calls none of these.
 _MAKE_ARRAYS = {"arange", "array", "empty", "empty_like", "full", "ones", "zeros"}
 
-_inner: list[Any] = []
-"""What numba knows inner kernels by; it does not keep them itself."""
-
 # Four float64 or eight float32: what most processors add at once.
 _LANE_BYTES = 32
 
@@ -85,11 +79,7 @@ def kernel(function: Kernel) -> Kernel:
 
 def inner_kernel(function: Kernel) -> Kernel:
     """Let kernels call a function: it is compiled as a part of them, and for Python stays as it is."""
-    options = _options(function) | {"no_cpython_wrapper": True, "pipeline_class": InnerCompiler}
-    dispatcher = numba.njit(**options)(function)
-    infer_global(function, types.Dispatcher(dispatcher))
-    _inner.append(dispatcher)
-    return function
+    return cast(Kernel, register_jitable(**_options(function), no_cpython_wrapper=True)(function))
 
 
 @contextmanager

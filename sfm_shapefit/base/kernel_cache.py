@@ -36,7 +36,6 @@ import numba
 from numba.core import config
 from numba.core.caching import NullCache
 from numba.core.event import Listener, install_listener
-from numba.core.registry import cpu_target
 from numba.misc.appdirs import AppDirs
 
 from sfm_shapefit.base.kernel_code import pack, unpack
@@ -67,10 +66,9 @@ _measuring: "list[CompileTime]" = []
 
 def choose_target() -> str:
     """Return, and set unless it is set, numba's one target: the processor that kernels are compiled for."""
-    is_chosen = "_toplevel_target_context" in vars(cpu_target)
-    if not is_chosen and config.CPU_NAME == "host":
+    if config.CPU_NAME == "host":
         config.CPU_NAME = config.CPU_FEATURES = None
-    elif not is_chosen and config.CPU_NAME is None:
+    elif config.CPU_NAME is None:
         config.CPU_NAME, config.CPU_FEATURES = _portable_target(), ""
     return config.CPU_NAME or str(llvm.get_host_cpu_name())
 

@@ -45,15 +45,14 @@ class _PlainConversion:
         kind = param.type_descriptor.annotation
         if not is_list and kind in (str, Path) and type(value) is str:
             return kind(value)
-        param._runtime_param = None
-        return param.get_runtime_param().coerce(value, param=param, ctx=ctx)
+        return type(param).get_runtime_param(param).coerce(value, param=param, ctx=ctx)
 
 
 def convert_plainly(parameters: Iterable[Any]) -> None:
     """Convert the words and paths of a command's parameters without typer."""
     for parameter in parameters:
-        if getattr(parameter, "_runtime_param", parameter) is None:  # other versions have no such thing
-            parameter._runtime_param = _PlainConversion()
+        if hasattr(parameter, "get_runtime_param"):  # which earlier versions do not have
+            parameter.get_runtime_param = _PlainConversion
 
 
 class _ByImportance(TyperGroup):

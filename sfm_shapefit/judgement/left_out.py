@@ -16,15 +16,16 @@ seen from the front, for one. Then the share of its column that they leave, `fre
 that keypoints share, as those of distortion are, grow by one over its root.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.losses import CAUCHY, weighed
 from sfm_shapefit.judgement.limits import FEWEST_POINTS, FITTING_PX
 from sfm_shapefit.pairs.kernels import fill_basis, median
 from sfm_shapefit.scene.images import Images, Pictures
@@ -107,12 +108,7 @@ def leave_one_out(
     arrays = *(frozen(np.ascontiguousarray(array)) for array in given), counts, figures
 
     rows = np.arange(n) if asked is None else np.flatnonzero(asked)
-    if threads <= 1:
-        # Where memory is short, Python waits for ever for a thread that could not begin.
-        fit_images(rows, *arrays)
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(lambda own: fit_images(own, *arrays), np.array_split(rows, threads)))
+    list(in_threads(threads, lambda own: fit_images(own, *arrays), np.array_split(rows, max(threads, 1))))
     return LeftOut(counts, *figures.T)
 
 
@@ -269,7 +265,7 @@ def _fill_system(
         return 0.0
     scale = max(median(work, ahead) / _MEDIAN_SQUARE, _LEAST_NOISE)
     for k in range(ahead):
-        weight = 1.0 / (1.0 + squares[k] / (_WIDTH * _WIDTH * scale))
+        weight = weighed(CAUCHY, 1.0, squares[k] / (_WIDTH * _WIDTH * scale))
         for side in range(2):
             line = lines[k, side]
             for row in range(8):

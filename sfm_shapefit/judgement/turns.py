@@ -45,6 +45,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
 from sfm_shapefit.base.geometry import nearest_rotations, rotation_angles_deg
+from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.limits import ALIKE_DEG, HALF, KNOWN_DEG, MANY, MOST_COMPARED, RARE
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
@@ -132,7 +133,7 @@ def fit_as_placed(directions: PairDirections) -> FloatArray:
     """Return about the mean robust weight of the matches of k pairs under the given rotations, (k,)."""
     inlier_share = directions.num_inliers / np.maximum(directions.num_matches, 1)
     residual = _MEAN_OF_MEDIAN * np.nan_to_num(directions.median_residual_px) / LAST_WIDTH_PX
-    return np.asarray(inlier_share / (1.0 + residual**2) ** 2)
+    return np.asarray(weighed(GEMAN_MCCLURE, inlier_share, residual**2))
 
 
 def weigh_pairs(
@@ -407,7 +408,7 @@ def _common_turn(
     turn = votes[chosen[int(np.argmax(totals))]]
     for _ in range(_AVERAGING_STEPS):
         off = _angles(votes[voting] @ turn.T) / sigmas[voting]
-        shares = weights[voting] / sigmas[voting] ** 2 / (1.0 + (off / _AGREEING_SIGMAS) ** 2) ** 2
+        shares = weighed(GEMAN_MCCLURE, weights[voting] / sigmas[voting] ** 2, (off / _AGREEING_SIGMAS) ** 2)
         turn = nearest_rotations(np.einsum("k,kab->ab", shares, votes[voting]))
     return np.asarray(turn)
 

@@ -15,8 +15,6 @@ averaging, cameras that only turn are as good as others.
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import fields
 from functools import partial
 from typing import NamedTuple
@@ -25,6 +23,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import refine_two_view_poses
@@ -90,14 +89,11 @@ def estimate_relative_rotations(
         fits = near.weight_shares >= likely.least_weights[tried]
         parts, places, others = [near.subset(fits)], [tried[fits]], np.delete(others, tried[fits])
     slices = [others[k : k + _PAIRS_PER_SLICE] for k in range(0, len(others), _PAIRS_PER_SLICE)]
-    with ExitStack() as stack:
-        # Where memory is short, Python waits for ever for a thread that could not begin.
-        share_out = map if threads <= 1 else stack.enter_context(ThreadPoolExecutor(threads)).map
-        for part, has_pose in share_out(partial(_estimate_slice, batch, are_many), slices):
-            places.append(slices[len(parts) - (likely is not None)][has_pose])
-            parts.append(part)
-            if advance is not None:
-                advance(sum(map(len, places)))
+    for part, has_pose in in_threads(threads, partial(_estimate_slice, batch, are_many), slices):
+        places.append(slices[len(parts) - (likely is not None)][has_pose])
+        parts.append(part)
+        if advance is not None:
+            advance(sum(map(len, places)))
     return concatenate_rotations(parts).subset(np.argsort(np.concatenate([*places, others[:0]])))
 
 

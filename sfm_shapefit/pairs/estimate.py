@@ -1,12 +1,13 @@
 """Directions of many pairs from their matches, and which to believe."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, frozen
+from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.pairs.kernels import MEASURES, MIN_MATCHES, estimate_pairs
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, first_reasons, is_usable
@@ -34,12 +35,7 @@ def run_over_pairs(kernel: Callable[..., None], matches: RayMatches, threads: in
     rays = frozen(np.ascontiguousarray(matches.rays_i)), frozen(np.ascontiguousarray(matches.rays_j))
     arrays = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
     cuts = [len(matches.pairs) * share // threads for share in range(threads + 1)]
-    if threads == 1:
-        # Where memory is short, Python waits for ever for a thread that could not begin.
-        kernel(*cuts, *arrays, *others)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda begin, end: kernel(begin, end, *arrays, *others), cuts[:-1], cuts[1:]))
+    list(in_threads(threads, lambda cut: kernel(*cut, *arrays, *others), pairwise(cuts)))
 
 
 def _judge(

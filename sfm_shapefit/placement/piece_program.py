@@ -21,6 +21,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, normalized
+from sfm_shapefit.base.losses import CAUCHY, loss, weighed
 from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.graph.groups import RigidGroups
@@ -313,8 +314,8 @@ def _linearize(
     first, second = (Standing(*(part[ends] for part in standing)) for ends in residuals.pieces.T)
     now = residuals.at(first, second)
     squares = np.sum(now**2, axis=1) / scale**2
-    cost = float(weights @ np.log1p(squares)) * scale**2
-    robust = weights / (1.0 + squares)
+    cost = float(weights @ loss(CAUCHY, squares)) * scale**2
+    robust = weighed(CAUCHY, weights, squares)
     num_unknowns = 7 * len(sizes)
     columns = np.empty((len(now), 3, 14))
     for k in range(7):

@@ -18,6 +18,7 @@ from sfm_shapefit.base.geometry import (
     nearest_rotations,
     rotation_angles_deg,
 )
+from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
@@ -97,7 +98,7 @@ class PieceTies:
     @property
     def pair_of(self) -> IntArray:
         """Pair of each match, (M,)."""
-        return np.repeat(np.arange(self.num_pairs), np.diff(self.matches.offsets))
+        return self.matches.list_of_rows()
 
     def subset(self, pairs: IntArray | BoolArray) -> "PieceTies":
         """Return some of the pairs."""
@@ -208,7 +209,7 @@ def _elect(votes: Votes, has_turn: BoolArray) -> Iterator[tuple[float, int, int,
 def _mean(turns: FloatArray, sigmas_deg: FloatArray, soundness: FloatArray, near: FloatArray) -> FloatArray:
     """Return the mean of turns (k, 3, 3), in which those far from one hardly count."""
     off = rotation_angles_deg(turns @ near.T) / (2.0 * np.hypot(sigmas_deg, 3.0 * _SIGMA_FLOOR_DEG))
-    weights = soundness / np.hypot(sigmas_deg, _SIGMA_FLOOR_DEG) ** 2 / (1.0 + off**2) ** 2
+    weights = weighed(GEMAN_MCCLURE, soundness / np.hypot(sigmas_deg, _SIGMA_FLOOR_DEG) ** 2, off**2)
     return nearest_rotations((weights[:, None, None] * turns).sum(axis=0))
 
 

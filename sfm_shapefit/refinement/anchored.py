@@ -13,6 +13,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.losses import ARCTANGENT, loss, weighed
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
@@ -34,7 +35,7 @@ _CONVERGED = 1e-9  # relative decrease of the cost; a smaller one is the last
 
 def weighted_anchors(anchors: KnownPositions, t: FloatArray) -> KnownPositions:
     """Return the anchors of plain squares whose pull at locations (n, d) is that of these."""
-    weights = 1.0 / (1.0 + (anchors.chi2(t) / KERNEL_WIDTH**2) ** 2)
+    weights = weighed(ARCTANGENT, 1.0, anchors.chi2(t) / KERNEL_WIDTH**2)
     return anchors._replace(information=weights[:, None, None] * anchors.information)
 
 
@@ -92,7 +93,7 @@ class _AnchoredTerms(AngularTerms):
 
     def cost(self, t: FloatArray) -> float:
         """Return the cost at t, (n, d)."""
-        kernels = 0.5 * KERNEL_WIDTH**2 * np.arctan(self._anchors.chi2(t) / KERNEL_WIDTH**2)
+        kernels = 0.5 * KERNEL_WIDTH**2 * loss(ARCTANGENT, self._anchors.chi2(t) / KERNEL_WIDTH**2)
         return super().cost(t) + float(np.sum(kernels))
 
     def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -33,6 +33,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread, tangent_bases
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.losses import ARCTANGENT, GEMAN_MCCLURE, loss, weighed
 from sfm_shapefit.base.scipy_parts import chdtri
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -135,7 +136,7 @@ def refine_angles(
         settled = bool((lower >= (1.0 - _SETTLED) * levels).all())
         levels = levels if settled else lower
         information = _information(graph, spread, levels[classes])
-        terms = AngularTerms(graph, information, steep=not settled)
+        terms = AngularTerms(graph, information, ARCTANGENT if settled else GEMAN_MCCLURE)
         moved, damping, before, after = take_angular_step(terms, factor, t, damping)
         is_still = (
             _motion(t, moved) <= max(_STILL, still * levels.min()) or before - after <= _CONVERGED * before
@@ -165,9 +166,9 @@ def robust_cost(measured: MeasuredGraph, locations: FloatArray, levels: FloatArr
 class AngularTerms:
     """The robust cost of the directions, each with its own M_e, and its normal equations."""
 
-    def __init__(self, graph: ViewGraph, information: FloatArray, *, steep: bool = False) -> None:
-        """Take M_e, (m, d, d); `steep` for the kernel of Geman and McClure in place of the arctangent."""
-        self._graph, self._information, self._steep = graph, information, steep
+    def __init__(self, graph: ViewGraph, information: FloatArray, kind: int = ARCTANGENT) -> None:
+        """Take M_e, (m, d, d), and the kind of the loss, see `base.losses`."""
+        self._graph, self._information, self._kind = graph, information, kind
 
     def cost(self, t: FloatArray) -> float:
         """Return the sum of the kernel over the pairs at locations (n, d) of any scale."""
@@ -189,12 +190,12 @@ class AngularTerms:
         """Return the locations (n, d) after a step from t."""
         return unit_norm(t + step)
 
-    def _arguments(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float, bool]:
-        """Return what the kernels take: baselines, v, w, M, the floor under |d|, and which kernel."""
+    def _arguments(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float, int]:
+        """Return what the kernels take: baselines, v, w, M, the floor under |d|, and the kind of loss."""
         graph = self._graph
         baselines = differences(t, graph.edges)
         floor = _SHORTEST * float(np.median(np.linalg.norm(baselines, axis=1)))
-        return baselines, graph.directions, graph.weights, self._information, floor, self._steep
+        return baselines, graph.directions, graph.weights, self._information, floor, self._kind
 
 
 def allocate_normal(plan: SymbolicFactor | LaplacianFactor, dimension: int) -> LaplacianFactor:
@@ -327,8 +328,8 @@ def _inform(axes: Any, variances: Any, v: Any, level: Any, out: Any) -> None:
 
 
 @kernel
-def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: float, steep: bool) -> float:
-    """Return sum_e w_e / 2 * k^2 rho(chi2 / k^2), rho(x) = atan x, or x / (1 + x) if `steep`."""
+def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: float, kind: int) -> float:
+    """Return sum_e w_e / 2 * k^2 rho(chi2 / k^2) for a kind of loss rho."""
     m, d = v.shape
     total = 0.0
     residual = np.empty(d)
@@ -344,13 +345,13 @@ def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: flo
             for b in range(d):
                 chi2 += residual[a] * information[e, a, b] * residual[b]
         x = chi2 / KERNEL_WIDTH**2
-        total += 0.5 * w[e] * KERNEL_WIDTH**2 * (x / (1.0 + x) if steep else np.arctan(x))
+        total += 0.5 * w[e] * KERNEL_WIDTH**2 * loss(kind, x)
     return total
 
 
 @kernel
 def _linearize_pairs(
-    baselines: Any, v: Any, w: Any, information: Any, floor: float, steep: bool, out: Any
+    baselines: Any, v: Any, w: Any, information: Any, floor: float, kind: int, out: Any
 ) -> None:
     """Write J^T M J, the damping's weight, and J^T M r of each pair, times the kernel's weight.
 
@@ -379,7 +380,7 @@ def _linearize_pairs(
             chi2 += (u[a] - v[e, a]) * pull[a]
             trace += information[e, a, a]
         x = chi2 / KERNEL_WIDTH**2
-        weight = w[e] / ((1.0 + x) ** 2 if steep else 1.0 + x * x)
+        weight = weighed(kind, w[e], x)
         damped[e] = w[e] * trace / (d * length * length)
         for a in range(d):
             gradient[e, a] = 0.0

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
 
 
 @inner_kernel
@@ -94,8 +95,7 @@ def reweigh_pairs(
     for e in range(len(pairs)):
         i, j = pairs[e, 0], pairs[e, 1]
         square = _world_residual(measured[e], turns[i], turns[j], x)
-        loss = 1.0 + square / (scale * scale)
-        w = weights[e] / (loss * loss)
+        w = weighed(GEMAN_MCCLURE, weights[e], square / (scale * scale))
         robust[e] = w
         for c in range(3):
             gradient[i, c] -= w * x[c]
@@ -260,8 +260,7 @@ def move_to_modes(
 def _closeness(a: Any, b: Any, scale: float) -> float:
     """Return 1 / (1 + (angle / scale)^2)^2 of two unit quaternions, with 4 sin(angle / 4) for the angle."""
     cosine = abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3])
-    loss = 1.0 + 8.0 * max(1.0 - cosine, 0.0) / (scale * scale)
-    return float(1.0 / (loss * loss))
+    return float(weighed(GEMAN_MCCLURE, 1.0, 8.0 * max(1.0 - cosine, 0.0) / (scale * scale)))
 
 
 @kernel

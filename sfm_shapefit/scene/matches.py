@@ -21,6 +21,7 @@ from sfm_shapefit.base.arrays import (
     BoolArray,
     FloatArray,
     IntArray,
+    Lists,
     UInt32Array,
     hand_back_memory,
     rows_of_parts,
@@ -40,7 +41,7 @@ MOST_BESIDE_TRACKS = 16_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RayMatches:
+class RayMatches(Lists):
     """The matches of k image pairs, M in all, one pair after the other, as rays in world axes."""
 
     pairs: IntArray
@@ -62,7 +63,7 @@ class RayMatches:
 
     def thinned(self, most: int) -> "RayMatches":
         """Return the pairs with at most so many matches each, taken evenly."""
-        counts = np.diff(self.offsets)
+        counts = self.lengths()
         taken = np.minimum(counts, most)
         offsets = np.append(0, np.cumsum(taken))
         position = np.arange(offsets[-1]) - np.repeat(offsets[:-1], taken)

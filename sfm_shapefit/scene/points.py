@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, Lists
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.scene.matches import KeypointMatches
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Points:
+class Points(Lists):
     """Points with their tracks: point x has the observations offsets[x]:offsets[x + 1]."""
 
     xyz: FloatArray
@@ -32,13 +32,7 @@ class Points:
         """Number of points, x."""
         return len(self.xyz)
 
-    def lengths(self) -> IntArray:
-        """Return the number of observations of each point, (x,)."""
-        return np.diff(self.offsets)
-
-    def points_seen(self) -> IntArray:
-        """Return the point of each observation, (o,)."""
-        return np.repeat(np.arange(self.num_points), self.lengths())
+    points_seen = Lists.list_of_rows  # the point of each observation, (o,)
 
     def count_seen(self, num_images: int) -> IntArray:
         """Return how many observations each image has, (i,)."""

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, rows_of_parts
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, Lists, rows_of_parts
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.tracks.joining import number_trees, sampson_px, write_ray
@@ -50,7 +50,7 @@ class JoinedRows(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ObservedTracks:
+class ObservedTracks(Lists):
     """Observations in tracks. Track t has the observations offsets[t]:offsets[t + 1], by ascending camera."""
 
     offsets: IntArray
@@ -73,10 +73,6 @@ class ObservedTracks:
         """Number of tracks, t."""
         return len(self.offsets) - 1
 
-    def lengths(self) -> IntArray:
-        """Return the number of observations of each track, (t,)."""
-        return np.diff(self.offsets)
-
     def subset(self, chosen: IntArray) -> "ObservedTracks":
         """Return the given tracks, in that order."""
         every = JoinedRows(self.offsets, np.arange(len(self.cameras)))
@@ -84,7 +80,7 @@ class ObservedTracks:
 
     def of_points(self, points_seen: IntArray) -> "ObservedTracks":
         """Return the tracks of points, one each: what observations (m,) see, -1 for those to be left out."""
-        if np.array_equal(points_seen, np.repeat(np.arange(self.num_tracks), self.lengths())):
+        if np.array_equal(points_seen, self.list_of_rows()):
             return replace(self, ids=np.arange(self.num_tracks))  # as of matches, and large
         joined = JoinedRows(self.offsets, np.arange(len(self.cameras))).of_points(points_seen)
         return self._of_rows(joined, np.arange(len(joined.offsets) - 1))

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, rows_of_parts
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, Lists, rows_of_parts
 from sfm_shapefit.base.forests import merge_sets, root_of
 from sfm_shapefit.base.jit import kernel, mix_bits
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -44,7 +44,7 @@ _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Tracks:
+class Tracks(Lists):
     """Points seen by several cameras, as rays. Point p has the observations offsets[p]:offsets[p + 1]."""
 
     offsets: IntArray
@@ -58,10 +58,6 @@ class Tracks:
     def num_tracks(self) -> int:
         """Number of points, p."""
         return len(self.offsets) - 1
-
-    def lengths(self) -> IntArray:
-        """Return the number of observations of each point, (p,)."""
-        return np.diff(self.offsets)
 
     def subset(self, chosen: IntArray) -> "Tracks":
         """Return the given tracks, in that order."""
@@ -279,7 +275,7 @@ def join_points(
         noise_px: standard deviation of an observation, per axis.
     """
     n = graph.num_nodes
-    points = n + np.repeat(np.arange(tracks.num_tracks), tracks.lengths())
+    points = n + tracks.list_of_rows()
     own = (noise_px * pixel_angles[tracks.cameras]) ** 2
     names = None if graph.names is None else [*graph.names, *(f"point {k}" for k in range(tracks.num_tracks))]
     joint = ViewGraph(

@@ -1,12 +1,12 @@
 """Work is shared out in order, a few tasks ahead of the answers, and what is not needed is cancelled."""
 
 from concurrent.futures import ThreadPoolExecutor
-from threading import Event
+from threading import Event, get_ident
 
 import pytest
 
 from sfm_shapefit.base import executors
-from sfm_shapefit.base.executors import WorkerError, answers
+from sfm_shapefit.base.executors import WorkerError, answers, in_threads
 
 
 def square(number):
@@ -17,6 +17,14 @@ def square(number):
 def test_answers_come_with_their_tasks_in_order(workers):
     with ThreadPoolExecutor(workers) as pool:
         assert list(answers(pool, square, range(100))) == [(k, k * k) for k in range(100)]
+
+
+@pytest.mark.parametrize("threads", [0, 1, 3])
+def test_threads_answer_in_order_and_a_single_one_is_the_callers(threads):
+    seen = set()
+    found = in_threads(threads, lambda task: (seen.add(get_ident()), square(task))[1], range(100))
+    assert list(found) == [k * k for k in range(100)]
+    assert (get_ident() in seen) == (threads <= 1)
 
 
 def test_tasks_are_made_only_a_few_ahead_of_the_answers(monkeypatch):
