@@ -27,7 +27,6 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.forests import connected_components, merge_sets, root_of
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.quaternions import matrices_of, quaternions_of
-from sfm_shapefit.graph.rigidity.growth import triangle_sets
 from sfm_shapefit.laplacian.operators import Adjacency, adjacency, group_by
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.rotations.averaging_kernels import (
@@ -139,15 +138,24 @@ def closing_shares(given: AveragingPairs, system: AveragingSystem) -> FloatArray
     Pairs ascend, with i < j. The share counts a triangle that closes, and one that does not, of average
     weight beside those that there are.
     """
-    graph, k, weights = system.graph, len(given.pairs), np.sqrt(given.supports)
+    weights = np.sqrt(given.supports)
+    closing, all_votes = _triangle_votes(given, system, weights)
+    mean = float(weights.mean())
+    return np.asarray((closing + mean) / (all_votes + 2.0 * mean))
+
+
+def _triangle_votes(
+    given: AveragingPairs, system: AveragingSystem, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the votes (k,) of the triangles of each pair that close, and of all; see `close_triangles`."""
+    graph, k = system.graph, len(given.pairs)
     closing, all_votes = np.empty(k), np.empty(k)
     for begin in range(0, k, _PAIRS_PER_SLICE):
         close_triangles(
             begin, min(begin + _PAIRS_PER_SLICE, k), graph.pointers, graph.neighbors, graph.edge_of,
             given.pairs, given.measured, weights, float(_CLOSING_SCALE), closing, all_votes,
         )  # fmt: skip
-    mean = float(weights.mean())
-    return np.asarray((closing + mean) / (all_votes + 2.0 * mean))
+    return closing, all_votes
 
 
 def anneal(given: AveragingPairs, system: AveragingSystem, turns: FloatArray, widest: float) -> FloatArray:
@@ -169,13 +177,15 @@ def reattach(given: AveragingPairs, system: AveragingSystem, turns: FloatArray) 
     return _move(given.pairs, given.measured, turns, np.sqrt(given.supports), system.graph)
 
 
-def reattach_blocks(given: AveragingPairs, turns: FloatArray) -> tuple[FloatArray, int]:
+def reattach_blocks(
+    given: AveragingPairs, system: AveragingSystem, turns: FloatArray
+) -> tuple[FloatArray, int]:
     """Return rotations (n, 4) with blocks of cameras turned as most pairs between them say, and the moves.
 
     The cameras of a block are tied by triangles of agreeing pairs. Where one or two pairs alone tie it to the
     rest, these may be wrong, and no camera of it can move by itself. The largest block stays.
     """
-    block_of = _find_blocks(given, turns)
+    block_of = _find_blocks(given, system, turns)
     between = np.flatnonzero(block_of[given.pairs[:, 0]] != block_of[given.pairs[:, 1]])
     if not len(between):
         return turns, 0
@@ -192,16 +202,14 @@ def reattach_blocks(given: AveragingPairs, turns: FloatArray) -> tuple[FloatArra
     return (quaternions_of(rotations @ matrices_of(turned)[block_of]) if moved else turns), moved
 
 
-def _find_blocks(given: AveragingPairs, turns: FloatArray) -> IntArray:
+def _find_blocks(given: AveragingPairs, system: AveragingSystem, turns: FloatArray) -> IntArray:
     """Return the block of each camera (n,), the largest one as the last; see `reattach_blocks`."""
     squares = np.empty(len(given.pairs))
     residual_squares(given.pairs, given.measured, turns, squares)
-    agreeing = given.pairs[squares <= _COLDEST**2]
-    set_of = triangle_sets(given.num_cameras, agreeing)
-    in_triangles = np.bincount(set_of, minlength=1)[set_of] > 1
-    block_of = connected_components(given.num_cameras, agreeing[in_triangles])
-    sizes = np.bincount(block_of)
-    order = np.argsort(sizes, kind="stable")
+    agrees = squares <= _COLDEST**2
+    _, votes = _triangle_votes(given, system, agrees.astype(np.float64))
+    block_of = connected_components(given.num_cameras, given.pairs[agrees & (votes > 0.0)])
+    order = np.argsort(np.bincount(block_of), kind="stable")
     return np.asarray(np.argsort(order)[block_of])
 
 

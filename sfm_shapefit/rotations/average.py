@@ -230,7 +230,7 @@ def _answers(given: AveragingPairs, subsets: list[BoolArray], threads: int) -> I
             turns, _ = reattach(weighed, system, follow_spanning_tree(keyed))
             turns = anneal(weighed, system, turns, float(widest))
             turns, moved = reattach(weighed, system, turns)
-            turns, blocks_moved = reattach_blocks(weighed, turns)
+            turns, blocks_moved = reattach_blocks(weighed, system, turns)
             if moved or blocks_moved:
                 turns = anneal(weighed, system, turns, float(_REATTACHED))
             turns, last = refine_fully(part, system, turns)
