@@ -7,7 +7,7 @@
                length at three times its median
 
 Between them cameras move to where most of their pairs want them: a camera whose link in the tree is false may
-sit where that pair alone fits, and no narrowing loss frees it.
+sit where that pair alone fits, and no narrowing loss frees it. Blocks of cameras then do the same.
 
 The wide loss in the beginning has one minimum near the tree's answer; the narrow one in the end does not see
 false pairs. The full information from the start is not robust: false pairs state theirs as well.
@@ -18,20 +18,22 @@ Zisserman, "Visual reconstruction", 1987 (annealing a robust loss); Zhang et al.
 averaging: uncertainties and robust losses", CVPR 2023 (information of the pairs).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.forests import merge_sets, root_of
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.base.forests import connected_components, merge_sets, root_of
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.laplacian.operators import group_by
+from sfm_shapefit.base.quaternions import matrices_of, quaternions_of
+from sfm_shapefit.laplacian.operators import Adjacency, adjacency, group_by
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.rotations.averaging_kernels import (
     close_triangles,
     follow_tree,
     move_to_modes,
+    residual_squares,
     reweigh_pairs,
     turn_cameras,
     weigh_blocks,
@@ -136,15 +138,24 @@ def closing_shares(given: AveragingPairs, system: AveragingSystem) -> FloatArray
     Pairs ascend, with i < j. The share counts a triangle that closes, and one that does not, of average
     weight beside those that there are.
     """
-    graph, k, weights = system.graph, len(given.pairs), np.sqrt(given.supports)
+    weights = np.sqrt(given.supports)
+    closing, all_votes = _triangle_votes(given, system, weights)
+    mean = float(weights.mean())
+    return np.asarray((closing + mean) / (all_votes + 2.0 * mean))
+
+
+def _triangle_votes(
+    given: AveragingPairs, system: AveragingSystem, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the votes (k,) of the triangles of each pair that close, and of all; see `close_triangles`."""
+    graph, k = system.graph, len(given.pairs)
     closing, all_votes = np.empty(k), np.empty(k)
     for begin in range(0, k, _PAIRS_PER_SLICE):
         close_triangles(
             begin, min(begin + _PAIRS_PER_SLICE, k), graph.pointers, graph.neighbors, graph.edge_of,
             given.pairs, given.measured, weights, float(_CLOSING_SCALE), closing, all_votes,
         )  # fmt: skip
-    mean = float(weights.mean())
-    return np.asarray((closing + mean) / (all_votes + 2.0 * mean))
+    return closing, all_votes
 
 
 def anneal(given: AveragingPairs, system: AveragingSystem, turns: FloatArray, widest: float) -> FloatArray:
@@ -163,11 +174,53 @@ def anneal(given: AveragingPairs, system: AveragingSystem, turns: FloatArray, wi
 
 def reattach(given: AveragingPairs, system: AveragingSystem, turns: FloatArray) -> tuple[FloatArray, int]:
     """Return rotations (n, 4) with cameras moved to where most of their pairs want them, and the moves."""
-    turns, graph, all_moved = turns.copy(), system.graph, 0
-    weights = np.sqrt(given.supports)
+    return _move(given.pairs, given.measured, turns, np.sqrt(given.supports), system.graph)
+
+
+def reattach_blocks(
+    given: AveragingPairs, system: AveragingSystem, turns: FloatArray
+) -> tuple[FloatArray, int]:
+    """Return rotations (n, 4) with blocks of cameras turned as most pairs between them say, and the moves.
+
+    The cameras of a block are tied by triangles of agreeing pairs. Where one or two pairs alone tie it to the
+    rest, these may be wrong, and no camera of it can move by itself. The largest block stays.
+    """
+    block_of = _find_blocks(given, system, turns)
+    between = np.flatnonzero(block_of[given.pairs[:, 0]] != block_of[given.pairs[:, 1]])
+    if not len(between):
+        return turns, 0
+    # From block to block, each in the axes that it has in the world at present.
+    (i, j), pairs, rotations = given.pairs[between].T, block_of[given.pairs[between]], matrices_of(turns)
+    relative = rotations[j].transpose(0, 2, 1) @ matrices_of(given.measured[between]) @ rotations[i]
+    count = int(block_of.max()) + 1
+    graph = adjacency(count, pairs)
+    no_pair_moves_the_last = np.minimum(graph.pointers, graph.pointers[-2])
+    graph = replace(graph, pointers=frozen(no_pair_moves_the_last))
+    as_they_are = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+    votes = np.sqrt(given.supports[between])
+    turned, moved = _move(pairs, quaternions_of(relative), as_they_are, votes, graph)
+    return (quaternions_of(rotations @ matrices_of(turned)[block_of]) if moved else turns), moved
+
+
+def _find_blocks(given: AveragingPairs, system: AveragingSystem, turns: FloatArray) -> IntArray:
+    """Return the block of each camera (n,), the largest one as the last; see `reattach_blocks`."""
+    squares = np.empty(len(given.pairs))
+    residual_squares(given.pairs, given.measured, turns, squares)
+    agrees = squares <= _COLDEST**2
+    _, votes = _triangle_votes(given, system, agrees.astype(np.float64))
+    block_of = connected_components(given.num_cameras, given.pairs[agrees & (votes > 0.0)])
+    order = np.argsort(np.bincount(block_of), kind="stable")
+    return np.asarray(np.argsort(order)[block_of])
+
+
+def _move(
+    pairs: IntArray, measured: FloatArray, turns: FloatArray, votes: FloatArray, graph: Adjacency
+) -> tuple[FloatArray, int]:
+    """Return rotations (n, 4) that are moved to where most of the votes (k,) want them, and the moves."""
+    turns, all_moved = turns.copy(), 0
     for _ in range(_SWEEPS):
         moved = move_to_modes(
-            graph.pointers, graph.neighbors, graph.edge_of, given.pairs, given.measured, turns, weights,
+            graph.pointers, graph.neighbors, graph.edge_of, pairs, measured, turns, votes,
             float(_VOTING_SCALE), _MARGIN,
         )  # fmt: skip
         all_moved += moved

