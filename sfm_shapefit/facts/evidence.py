@@ -118,9 +118,9 @@ class UntiedGroup(_Group):
         """The same in a sentence."""
         does = "says" if self.is_loose else "checks"
         agree = f"{counted(self.num_agreeing, 'pair')} and {counted(self.num_points, 'point')}"
+        who = f"{_cameras(self.images)} to the rest"
         return (
-            f"nothing {does} how {len(self.images)} cameras ({first_of(list(self.images))}) stand to the "
-            f"rest: {agree} between them agree, {counted(self.num_contradicting, 'pair')} contradict; match "
+            f"nothing {does} how {who}: {agree} between them agree, {counted(self.num_contradicting, 'pair')} contradict; match "
             "more images across"
         )
 

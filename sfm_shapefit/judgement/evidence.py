@@ -20,6 +20,7 @@ from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import (
     FEW,
     FEWEST_ALIKE,
+    FEWEST_POINTS,
     HALF,
     KNOWN_DEG,
     MANY,
@@ -142,6 +143,13 @@ class PairFits:
         edges = np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
         rows = edges[parallel_rigid_pieces(count, edges, 3) == 0] if len(edges) else edges
         return np.asarray(np.isin(frame_of, rows) & np.isfinite(self.centers).all(axis=1))
+
+    @property
+    def may_hold(self) -> BoolArray:
+        """Pairs (k,) that agree, or whose matches suit the rotations and tell no direction."""
+        stands = np.isfinite(self.centers[self.directions.pairs]).all(axis=(1, 2))
+        is_silent = stands & ~np.isfinite(self.residuals_deg) & ~self.contradicts
+        return self.agrees | (is_silent & (self.directions.num_inliers >= FEWEST_POINTS))
 
     @property
     def sides(self) -> tuple[IntArray, IntArray]:
