@@ -8,6 +8,7 @@ from sfm_shapefit.adjustment.open_shape import estimate_open_shape
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.files.colmap.lenses import is_bogus
+from sfm_shapefit.judgement.duplicates import find_split_duplicates
 from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape, PairFits
 from sfm_shapefit.judgement.flights import find_flights
 from sfm_shapefit.judgement.lenses import find_odd_lenses
@@ -56,6 +57,8 @@ def gather_evidence(
     odd = (*find_odd_lenses(images, points, pictures, bogus), *find_flights(images))
     if fits is None:
         return ModelEvidence(lenses=lenses, oddities=odd)
+    if _has_keypoints(source.view, structure):
+        odd = (*odd, *find_split_duplicates(images, points, pictures, fits.directions, source.view))
     tied, untied = _tie(source, fits, structure)
     cuts, seams = find_cuts(*fits.sides, tied), tuple[Seam, ...]()
     if cuts:  # which are seams by the rotations that pairs across have by themselves
