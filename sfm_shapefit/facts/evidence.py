@@ -151,7 +151,7 @@ class ToldOpinion(Record):
     @property
     def statement(self) -> str:
         """The same in a sentence."""
-        by = "in the model that map made of the same database"
+        by = "in the model that map made of the same matches"
         parts = []
         if self.wrong:
             parts.append(

@@ -205,7 +205,7 @@ class SecondOpinion(NamedTuple):
     grade: Grade = Grade.LOOK
     """What the other model is worth by itself."""
     folder: str = "0"
-    """Where it stands among the models of the same database."""
+    """Where it stands among the models of the same matches."""
 
     @property
     def alike(self) -> IntArray:
