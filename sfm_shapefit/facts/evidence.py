@@ -118,10 +118,10 @@ class UntiedGroup(_Group):
         """The same in a sentence."""
         does = "says" if self.is_loose else "checks"
         agree = f"{counted(self.num_agreeing, 'pair')} and {counted(self.num_points, 'point')}"
-        who = f"{_cameras(self.images)} to the rest"
+        against = f"{counted(self.num_contradicting, 'pair')} contradict"
         return (
-            f"nothing {does} how {who}: {agree} between them agree, {counted(self.num_contradicting, 'pair')} contradict; match "
-            "more images across"
+            f"nothing {does} how {_cameras(self.images)} to the rest: {agree} between them agree, {against}; "
+            "match more images across"
         )
 
 

@@ -55,7 +55,7 @@ def find_few_ties(num_nodes: int, edges: IntArray) -> list[FewTies]:
 
 def are_bridges(num_nodes: int, edges: IntArray) -> BoolArray:
     """Return the edges (m,) without which two of their nodes are not connected."""
-    return _loop_numbers(num_nodes, edges) == 0
+    return np.asarray(_loop_numbers(num_nodes, edges) == 0)
 
 
 def _in_small_cuts(num_nodes: int, edges: IntArray) -> BoolArray:
