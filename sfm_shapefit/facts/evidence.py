@@ -118,10 +118,10 @@ class UntiedGroup(_Group):
         """The same in a sentence."""
         does = "says" if self.is_loose else "checks"
         agree = f"{counted(self.num_agreeing, 'pair')} and {counted(self.num_points, 'point')}"
+        against = f"{counted(self.num_contradicting, 'pair')} contradict"
         return (
-            f"nothing {does} how {len(self.images)} cameras ({first_of(list(self.images))}) stand to the "
-            f"rest: {agree} between them agree, {counted(self.num_contradicting, 'pair')} contradict; match "
-            "more images across"
+            f"nothing {does} how {_cameras(self.images)} to the rest: {agree} between them agree, {against}; "
+            "match more images across"
         )
 
 
@@ -151,7 +151,7 @@ class ToldOpinion(Record):
     @property
     def statement(self) -> str:
         """The same in a sentence."""
-        by = "in the model that map made of the same database"
+        by = "in the model that map made of the same matches"
         parts = []
         if self.wrong:
             parts.append(

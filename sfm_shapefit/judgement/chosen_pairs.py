@@ -6,6 +6,8 @@
     alike       pictures that look alike, wherever their cameras stand: a fold has put them apart
     seams       nearest and most alike across the weakest links of the model: the longest edges of the
                 shortest tree between the cameras, by common points, else by poses
+    others      all the rest, of up to 25 pictures: where sides are alike, likeness finds what contradicts
+                and leaves out what agrees
 
 Poses are compared by positions over the usual distance of neighbors, and by viewing directions over their
 usual angle. Pictures are compared by their descriptors, added up as differences from the nearest of some that
@@ -26,6 +28,7 @@ from sfm_shapefit.scene.images import Images
 NUM_DESCRIBED = 400
 """Descriptors of a picture that describe it; a tenth of those it has, so that comparing costs little."""
 _NEIGHBORS, _SHARED, _UNSHARED, _ALIKE = 6, 3, 3, 4  # pairs of an image by reason; 16 fit into 5 min of 100
+_FEW_IMAGES = 25  # images all of whose pairs are asked: a dozen each
 _NEAR, _LOOKED_AT = 12, 20  # images near in pose, and alike ones, that are looked at; more are never chosen
 _ACROSS = 5  # pairs across a seam, of each kind; three must agree on a turn
 _IMAGES_A_SEAM = 10  # images for each seam that is asked; a tenth of all in a part of its own is too many
@@ -118,6 +121,9 @@ def _lists(near: _Ranked, shared: Shared, alike: _Ranked) -> Iterator[tuple[str,
     yield "shared", *_first(most, _SHARED, count)
     yield "unshared", *_first(near.pairs()[apart], _UNSHARED, count)
     yield "alike", *_first(alike.pairs(), _ALIKE, count)
+    if count <= _FEW_IMAGES:
+        every = np.column_stack(np.triu_indices(count, 1))
+        yield "others", every, np.full(len(every), count)
 
 
 def _first(pairs: IntArray, most: int, count: int) -> tuple[IntArray, IntArray]:

@@ -20,6 +20,7 @@ from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import (
     FEW,
     FEWEST_ALIKE,
+    FEWEST_POINTS,
     HALF,
     KNOWN_DEG,
     MANY,
@@ -144,6 +145,13 @@ class PairFits:
         return np.asarray(np.isin(frame_of, rows) & np.isfinite(self.centers).all(axis=1))
 
     @property
+    def may_hold(self) -> BoolArray:
+        """Pairs (k,) that agree, or whose matches suit the rotations and tell no direction."""
+        stands = np.isfinite(self.centers[self.directions.pairs]).all(axis=(1, 2))
+        is_silent = stands & ~np.isfinite(self.residuals_deg) & ~self.contradicts
+        return self.agrees | (is_silent & (self.directions.num_inliers >= FEWEST_POINTS))
+
+    @property
     def sides(self) -> tuple[IntArray, IntArray]:
         """Pairs of cameras that agree (a, 2), and that contradict (b, 2)."""
         pairs = self.directions.pairs
@@ -197,7 +205,7 @@ class SecondOpinion(NamedTuple):
     grade: Grade = Grade.LOOK
     """What the other model is worth by itself."""
     folder: str = "0"
-    """Where it stands among the models of the same database."""
+    """Where it stands among the models of the same matches."""
 
     @property
     def alike(self) -> IntArray:

@@ -53,8 +53,20 @@ def find_few_ties(num_nodes: int, edges: IntArray) -> list[FewTies]:
     return [FewTies(np.flatnonzero(is_apart & (among == k)), int(crossing[k])) for k in found]
 
 
+def are_bridges(num_nodes: int, edges: IntArray) -> BoolArray:
+    """Return the edges (m,) without which two of their nodes are not connected."""
+    return np.asarray(_loop_numbers(num_nodes, edges) == 0)
+
+
 def _in_small_cuts(num_nodes: int, edges: IntArray) -> BoolArray:
     """Return the edges (m,) that are bridges, or a cut together with another edge."""
+    numbers = _loop_numbers(num_nodes, edges)
+    _, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+    return np.asarray((numbers == 0) | (counts[which] > 1))
+
+
+def _loop_numbers(num_nodes: int, edges: IntArray) -> IntArray:
+    """Return a number of each edge (m,): a random one if it closes a loop, else as the header has it."""
     levels, parent, edge_to = _spanning_forest(num_nodes, edges)
     is_loop = np.ones(len(edges), dtype=np.bool_)
     is_loop[edge_to[edge_to >= 0]] = False
@@ -65,8 +77,7 @@ def _in_small_cuts(num_nodes: int, edges: IntArray) -> BoolArray:
     for nodes in reversed(levels):
         numbers[edge_to[nodes]] = below[nodes]
         np.bitwise_xor.at(below, parent[nodes], below[nodes])
-    _, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
-    return np.asarray((numbers == 0) | (counts[which] > 1))
+    return np.asarray(numbers)
 
 
 def _spanning_forest(num_nodes: int, edges: IntArray) -> tuple[list[IntArray], IntArray, IntArray]:

@@ -101,7 +101,7 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     if len(named - confirmed) > MANY * count and len(named) > len(apart):
         clause = f"evidence speaks against {len(named)} of {counted(count, 'camera')}"
         yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
-    elsewhere = "it stands elsewhere in the model that map made of the same database"
+    elsewhere = "it stands elsewhere in the model that map made of the same matches"
     wrong = [camera for camera in wrong if camera not in apart]
     yield from of_each(Kind.SECOND_OPINION, names(wrong), f"{elsewhere}, which pairs support")
     yield from of_each(Kind.SECOND_OPINION, names(undecided), f"{elsewhere}, and pairs support neither")
@@ -124,7 +124,7 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
         clause = "at least half as much speaks for another place or rotation of it"
         yield from of_each(Kind.SECOND_OPINION, names(second.ambiguous.tolist()), clause)
         if second.has_nothing_in_common:
-            clause = "the model that map makes of the same database has another shape"
+            clause = "the model that map makes of the same matches has another shape"
             yield of_model(Kind.APART, clause)
 
 

@@ -15,6 +15,9 @@ A group that remains by itself is held by few pairs and points, or by none: pair
 may be rejected since. A pair that agrees says five things (its rotation, its direction), a point at least
 two, where more than chance fit. A group with seven of these or more is unchecked; with fewer, or if one
 camera has them all, it is loose: nothing says how it stands.
+
+Cameras hang on the rest if a single pair, or a single camera, holds them: they are outside the largest rigid
+piece that pairs and shared points make. What such a pair says nothing checks, be it of another scene.
 `scripts/results/verdict.md` has halves of scenes that few pairs tie.
 """
 
@@ -26,6 +29,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, rows_taken, sum_by
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
+from sfm_shapefit.judgement.few_ties import are_bridges
 from sfm_shapefit.judgement.limits import FEWEST_ALIKE, FEWEST_POINTS, OUTNUMBERED
 
 _MOST_RAYS = 200  # rays per node that are asked first; what these leave apart is asked by all
@@ -134,6 +138,45 @@ def find_groups(group: IntArray, rays: Rays, pairs: NodeLinks) -> tuple[IntArray
         if not one.is_loose:
             group[one.cameras] = names[0]
     return group, untied
+
+
+def find_hanging(count: int, rays: Rays, pairs: NodeLinks, known: IntArray) -> tuple[Untied, ...]:
+    """Return the groups of nodes, of one or more of all n, that a single pair or node holds.
+
+    Nodes (k, 2) are `known` to stand rightly to one another; those that no pair holds are not asked.
+    """
+    edges = _distinct_edges(np.concatenate([pairs.ends[pairs.fits], known]))
+    if not (outside := _outside(count, edges)).any():
+        return ()
+    rays = _of_three(rays)
+    rays = rows_taken(rays, np.isin(rays.points, rays.points[outside[rays.nodes]]))
+    names, *numbers = _count(np.arange(count), rays.blocks())
+    shared = np.column_stack(np.divmod(names[_BY_POINTS.tie(*numbers)], count))
+    edges = _distinct_edges(np.concatenate([edges, shared]))
+    outside, points = _outside(count, edges), rays.links()
+    among = connected_components(count, edges[outside[edges].all(axis=1)])
+    groups = (outside & (among == name) for name in np.unique(among[outside]).tolist())
+    return tuple(_tell(group, points, pairs)._replace(is_loose=False) for group in groups)
+
+
+def _distinct_edges(edges: IntArray) -> IntArray:
+    """Return each edge (m, 2) of two nodes once."""
+    return np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
+
+
+def _outside(count: int, edges: IntArray) -> BoolArray:
+    """Return the nodes (n,) of edges (m, 2) that are not in the largest rigid piece, if most are in it.
+
+    Else they are outside if bridges part them from most: a ring of neighbors is not rigid, and no tree.
+    """
+    asked = np.bincount(edges.ravel(), minlength=count) > 0
+    if not asked.any():
+        return asked
+    inside = np.isin(np.arange(count), edges[parallel_rigid_pieces(count, edges, 3) == 0])
+    if 2 * inside.sum() < asked.sum():
+        label = connected_components(count, edges[~are_bridges(count, edges)])
+        inside = label == np.argmax(np.bincount(label))
+    return np.asarray(asked & ~inside & (2 * inside.sum() >= asked.sum()))
 
 
 def _of_three(rays: Rays) -> Rays:

@@ -84,7 +84,7 @@ class CheckResult(Reported, Tabled):
     facts: CheckedFacts
     """The figures, as `check --json` prints them."""
     second_opinion: MapResult | None = None
-    """What `map_database` made of the same database, to compare with."""
+    """What `map_database` made of the same matches, to compare with."""
 
     @property
     def reconstruction(self) -> "pycolmap.Reconstruction":

@@ -8,12 +8,13 @@ from sfm_shapefit.adjustment.open_shape import estimate_open_shape
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.files.colmap.lenses import is_bogus
+from sfm_shapefit.judgement.duplicates import find_split_duplicates
 from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape, PairFits
 from sfm_shapefit.judgement.flights import find_flights
 from sfm_shapefit.judgement.lenses import find_odd_lenses
 from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED, SMALLEST_SHAPE
 from sfm_shapefit.judgement.seams import Seam, find_cuts, find_seams
-from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, links_of_pairs, rigid_groups
+from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, find_hanging, links_of_pairs, rigid_groups
 from sfm_shapefit.judgement.witnesses import are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
@@ -56,6 +57,8 @@ def gather_evidence(
     odd = (*find_odd_lenses(images, points, pictures, bogus), *find_flights(images))
     if fits is None:
         return ModelEvidence(lenses=lenses, oddities=odd)
+    if _has_keypoints(source.view, structure):
+        odd = (*odd, *find_split_duplicates(images, points, pictures, fits.directions, source.view))
     tied, untied = _tie(source, fits, structure)
     cuts, seams = find_cuts(*fits.sides, tied), tuple[Seam, ...]()
     if cuts:  # which are seams by the rotations that pairs across have by themselves
@@ -144,7 +147,7 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
     """Return what each image (i,) is tied to, by number, and the groups that hardly anything ties to it.
 
     Frames move as one, and what is fixed or joined stays. Where too few points are known for that, what pairs
-    and points hold is one, and no group is named.
+    and points hold is one, and no group is named but what hangs on one pair or image.
     """
     points, images, pictures = structure[:3]
     frames = images.frame_of
@@ -158,15 +161,20 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
     together = np.concatenate([np.zeros((0, 2), dtype=np.int64), *known])
     group = rigid_groups(len(images.frames.ids), rays, together)
     lost = _are_lost(source.view, structure, fitting, group[frames])
-    tied, groups = find_groups(group, rays._replace(fits=fitting & ~lost[rays.points]), pairs)
-    posed = np.unique(frames[images.is_posed])
+    rays = rays._replace(fits=fitting & ~lost[rays.points])
+    tied, groups = find_groups(group, rays, pairs)
+    posed, of = np.unique(frames[images.is_posed]), tied[frames]
     if 2 * np.bincount(tied[posed]).max(initial=0) < len(posed):
         held = fits.held(images)
         if 2 * held.sum() < images.is_posed.sum():
             held = fits.held(images, points.taken(fitting))
-        return np.where(held, 0, 1 + frames), ()
-    images_of = (np.flatnonzero(np.isin(frames, group.cameras)) for group in groups)
-    return tied[frames], tuple(map(lambda group, rows: group._replace(cameras=rows), groups, images_of))
+        of, groups = np.where(held, 0, 1 + frames), ()
+    named = [node for one in groups for node in one.cameras.tolist()]
+    holding = links_of_pairs(frames[fits.directions.pairs[fits.may_hold]], frames[fits.sides[1]])
+    hanging = find_hanging(len(group), rays, holding, together)
+    groups = (*groups, *(one for one in hanging if not np.isin(one.cameras, named).any()))
+    rows = (np.flatnonzero(np.isin(frames, one.cameras) & images.is_posed) for one in groups)
+    return of, tuple(one._replace(cameras=own) for one, own in zip(groups, rows, strict=True))
 
 
 def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray) -> BoolArray:

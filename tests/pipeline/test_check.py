@@ -227,7 +227,7 @@ def test_a_second_opinion_of_another_shape_is_a_reason_to_look(tmp_path):
     none, usual = np.zeros(0, dtype=np.int64), {"num_common": 8, "num_for": 0, "num_against": 0}
     rows = {"wrong": none, "undecided": none, "confirmed": none, "ambiguous": none}
     images = read_model(RING / "sparse/0").images
-    told = "the model that map makes of the same database has another shape"
+    told = "the model that map makes of the same matches has another shape"
     for share, said in ((0.05, []), (0.4, [told])):
         evidence = ModelEvidence(second=SecondOpinion(usual=share, **usual, **rows))
         assert [one.sentence for one in weigh_evidence(evidence, images)] == said
