@@ -74,8 +74,9 @@ def estimate_open_shape(
         few = run.thin_problem(tracks, found, times=FINE_TIMES)
         after, _ = run.solve(few, _FALL, settles_points=True)
         options = after.options_at_optimum()
-        free = estimate_covariances(freedom.apply(problem, None), options, **freedom.overrides())
-        held = estimate_covariances(problem, options, deciding=free.deciding)
+        freed = freedom.apply(problem, None)
+        free = estimate_covariances(freed, options, of_shape=True, **freedom.overrides())
+        held = estimate_covariances(problem, options, of_shape=True, deciding=free.deciding)
         drift = _drift(images, after.images)
     except UnsolvableError:
         return None

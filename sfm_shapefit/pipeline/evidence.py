@@ -62,14 +62,15 @@ def gather_evidence(
         across = np.concatenate([cut.contradicting for cut in cuts])
         seams = find_seams(cuts, ask_rotations(source, across, threads), source.images.rotations)
     apart = [camera for seam in seams for camera in seam.cameras.tolist()]
-    contradicted = fits.contradicted(images)
-    doubted = np.isin(np.arange(images.num_images), [one.camera for one in contradicted])
-    sure = ask_pixels(source, structure, doubted)
+    contradicted, places = fits.contradicted(images), fits.other_places()
+    asked_of = contradicted if source.has_database else (*contradicted, *places)
+    doubted = np.isin(np.arange(images.num_images), [one.camera for one in asked_of])
+    sure = ask_pixels(source, structure, doubted)  # own tracks hold no second place of who fits the first
     num_unasked = int(np.sum(source.view.num_keypoints == 0)) if source.inputs.is_made else 0
     return ModelEvidence(
         lenses=lenses,
         oddities=odd,
-        places=fits.other_places(),
+        places=tuple(one for one in places if source.has_database or not sure[one.camera]),
         seams=seams,
         contradicted=tuple(one for one in contradicted if not sure[one.camera]),
         untied=tuple(one for one in untied if 2 * np.isin(one.cameras, apart).sum() < len(one.cameras)),
