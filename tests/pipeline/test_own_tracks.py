@@ -126,7 +126,7 @@ def short_rig(seed, baseline):
 
 
 def test_a_rig_too_short_to_tell_the_scale_leaves_no_shape_open():
-    """Pixels tell the scale to half of it here; the scale is no part of the shape, which noise hardly bends."""
+    """Pixels tell the scale to half of it here; it is no part of the shape, which noise hardly bends."""
     model = short_rig(0, 0.005)
     found, checked = sfm_shapefit.locate(model), sfm_shapefit.check(model)
     assert checked.verdict.grade is found.verdict.grade is Grade.GOOD
@@ -137,7 +137,7 @@ def test_a_rig_too_short_to_tell_the_scale_leaves_no_shape_open():
 def test_a_rotation_off_by_a_little_is_mended_where_halves_hardly_move_the_cameras(seed):
     """1.3 pixels of one camera: what the halves say is believed, though pixels gain little by it."""
     found = sfm_shapefit.locate(turned(model_of(*orbit(seed), 900.0, seed=seed), 6, 0.08))
-    # The error of the turn by the noise of 200 points is about .003 degrees, more as few points hold its place.
+    # Noise of 200 points turns it by some .003 degrees; their depths, which noise moves too, by more.
     assert found.turned_deg[5] == pytest.approx(0.08, abs=0.02)
     assert np.nanmax(np.delete(found.turned_deg, 5)) < 0.002  # nearly held
 
