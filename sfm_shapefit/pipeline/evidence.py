@@ -63,8 +63,9 @@ def gather_evidence(
         seams = find_seams(cuts, ask_rotations(source, across, threads), source.images.rotations)
     apart = [camera for seam in seams for camera in seam.cameras.tolist()]
     contradicted, places = fits.contradicted(images), fits.other_places()
-    asked_of = contradicted if source.has_database else (*contradicted, *places)
-    doubted = np.isin(np.arange(images.num_images), [one.camera for one in asked_of])
+    asked_of = [one.camera for one in contradicted]
+    asked_of += [] if source.has_database else [one.camera for one in places]
+    doubted = np.isin(np.arange(images.num_images), asked_of)
     sure = ask_pixels(source, structure, doubted)  # own tracks hold no second place of who fits the first
     num_unasked = int(np.sum(source.view.num_keypoints == 0)) if source.inputs.is_made else 0
     return ModelEvidence(
@@ -94,7 +95,7 @@ def ask_shape(
         return None
     held = {"lenses_held": lenses_held, "rotations_held": rotations_held}
     found = None if all(held.values()) else estimate_open_shape(images.part(rows), tracks, **held)
-    return None if found is None else OpenShape.of(images, rows, *found)
+    return None if found is None else OpenShape.of(images, rows, found)
 
 
 def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:

@@ -18,6 +18,7 @@ from functools import partial
 
 import numpy as np
 
+from sfm_shapefit.adjustment.lens_doubts import excess
 from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.executors import nobody
@@ -310,10 +311,11 @@ def _ask_shape(stand: Stand, images: Images, *, lenses_held: bool) -> OpenShape 
 
 
 def _widened(judged: Judged, shape: OpenShape | None, scale: float) -> Judged:
-    """Return the piece with what its shape leaves open, `scale` from the solver's unit."""
+    """Return the piece with what its shape leaves open beyond its noise, `scale` from the solver's unit."""
     if shape is None:
         return judged
-    return replace(judged, open_covariances=shape.covariances[judged.cameras] / scale**2)
+    left_open = shape.covariances[judged.cameras] / scale**2
+    return replace(judged, open_covariances=excess(left_open, judged.covariances))
 
 
 def _tied_by_priors(stand: Stand, images: Images) -> IntArray | None:
