@@ -75,6 +75,7 @@ from sfm_shapefit.placement.prior_fit import PriorFit, compare_with_priors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.tracks.options import NodeOptions
 
+_OPEN = 1e100  # squared units; larger covariances overflow, and mean that nothing holds a camera
 _SMALLEST_ADJUSTED = 8
 """Cameras of a further piece that is adjusted; smaller ones are placed and seeded only, for their seconds."""
 
@@ -315,7 +316,8 @@ def _widened(judged: Judged, shape: OpenShape | None, scale: float) -> Judged:
     if shape is None:
         return judged
     left_open = shape.covariances[judged.cameras] / scale**2
-    return replace(judged, open_covariances=excess(left_open, judged.covariances))
+    told = np.clip(judged.covariances, -_OPEN, _OPEN)  # a camera that hangs loose has huge ones
+    return replace(judged, open_covariances=excess(left_open, told))
 
 
 def _tied_by_priors(stand: Stand, images: Images) -> IntArray | None:
