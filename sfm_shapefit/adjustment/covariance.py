@@ -14,7 +14,7 @@ one solve for each of the at most seven motions.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -64,6 +64,7 @@ def estimate_covariances(
     options: AdjustmentOptions | None = None,
     *,
     deciding: BoolArray | None = None,
+    of_shape: bool = False,
     **overrides: Any,
 ) -> FrameCovariances:
     """Return the covariances of the frames at the minimum that a problem stands at.
@@ -75,6 +76,7 @@ def estimate_covariances(
         problem: `Adjusted.problem`.
         options: as it was adjusted with.
         deciding: (n,) frames that decide the gauge; those that are not known far worse than most if None.
+        of_shape: whether the scale is taken off too where something holds it, as offsets in rigs do.
         **overrides: single options by name.
 
     Raises:
@@ -82,6 +84,8 @@ def estimate_covariances(
     """
     options = merge_options(options, AdjustmentOptions, overrides)
     system = ground_system(problem, options)
+    if of_shape:
+        system = system.without_scale(problem)
     blocks = system.factor.inverse_blocks()
     nodes = system.seen_nodes() if deciding is None else system.layout.node_of_frame[deciding]
     if system.free.size:
@@ -127,6 +131,13 @@ class GroundedSystem:
     def _regauge(self, moved: FloatArray, dual: FloatArray) -> FloatArray:
         """Return moves (N, 6, r) less the motions that a dual reads off them."""
         return np.asarray(moved - self.motions @ np.einsum("nai,nar->ir", dual, moved))
+
+    def without_scale(self, problem: AdjustmentProblem) -> "GroundedSystem":
+        """Return the same with a gauge that takes off the scaling of the centers too, whatever holds it."""
+        if self.free[-1].any():
+            return self
+        free = np.column_stack([self.free, np.eye(len(self.free))[:, -1]])
+        return replace(self, free=free, motions=_motions(problem, self.layout, free, self.unseen))
 
     def seen_nodes(self) -> IntArray:
         """Return the nodes of frames that move and are seen."""

@@ -27,9 +27,10 @@ rotations. Who measured rotations better than the matches know them has to say s
 Points of the model itself were fitted with its rotations. Where a camera yaws on the spot, or baselines are
 short, lens errors turn whole groups of freed frames by degrees and gain next to nothing; that moves cameras
 by 4 to 20 % of the extent in a made room, by 7 % of it with an indoor drone. Halves of sound models of 8 to
-100 images move them by .6 % at most, and are believed up to 2 %. Beyond, or where points do not fit frames,
-the gain counts (`without_unseen_turns`): errors of sigma about every axis would raise the cost by as much as
-random turns of the freed frames do. With C the costs of held, freed and turned frames,
+100 images move them by .6 % at most. They are believed up to 2 %, the geometric mean of .6 and 7 %. Beyond,
+or where points do not fit frames, the gain counts (`without_unseen_turns`): errors of sigma about every axis
+would raise the cost by as much as random turns of the freed frames do. With C the costs of held, freed and
+turned frames,
 
     sigma_seen^2 = sigma^2 (C_held - C_free) / (C_turned - C_free)
 

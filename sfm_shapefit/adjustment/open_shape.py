@@ -3,11 +3,11 @@
 Lenses of a model that nobody calibrated were found with its shape, and so were its rotations, if its own
 tracks are all there is. Few views, forward motion, or a yaw on the spot leave focal length, distortion and
 shape free together: a model that fits its points is one of many. What the points leave open of each center
-is the sum of two parts, with lenses pulled by what unmeasured ones may be off, a factor of two:
+is the larger one of two parts, with lenses pulled by what unmeasured ones may be off, a factor of two:
 
-    covariance    by noise, what it grows by when the lenses are free, at the points where the model stands
+    covariance    by noise, with lenses free, and rotations if the tracks made them, where the model stands
     drift         |d|^2 / 3 along every axis, d the way to the minimum with all free: one draw of three axes;
-                  by few points, as in a fine solve
+                  by few points, as in a fine solve, whose noise it has in it
 
 The first sees valleys along which nothing pulls, the second those at whose other end the model stands. With
 sound models of 7 to 100 images, 97 % of the cameras drift by less than 2 % of the extent, 4 % at most; 10 of
@@ -15,7 +15,6 @@ sound models of 7 to 100 images, 97 % of the cameras drift by less than 2 % of t
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -40,19 +39,10 @@ _FALL = 1e-4
 _FOCAL_SIGMA = float(np.log(2.0))  # share; a focal length that only a bent shape holds may be twice too long
 
 
-class LeftOpen(NamedTuple):
-    """What is left open of centers, covariances (i, 3, 3) in squared units of the images."""
-
-    more: FloatArray
-    """Beside what noise does where lenses are known."""
-    every: FloatArray
-    """With what noise does."""
-
-
 def estimate_open_shape(
     images: Images, tracks: ObservedTracks, *, lenses_held: bool = False, rotations_held: bool = False
-) -> LeftOpen | None:
-    """Return what a model's own tracks leave open of its centers.
+) -> FloatArray | None:
+    """Return what a model's own tracks leave open of its centers, covariances (i, 3, 3) in squared units.
 
     None where it is not known: too many frames, or points that leave more open than a similarity.
 
@@ -74,14 +64,13 @@ def estimate_open_shape(
         few = run.thin_problem(tracks, found, times=FINE_TIMES)
         after, _ = run.solve(few, _FALL, settles_points=True)
         options = after.options_at_optimum()
-        free = estimate_covariances(freedom.apply(problem, None), options, **freedom.overrides())
-        held = estimate_covariances(problem, options, deciding=free.deciding)
-        drift = _drift(images, after.images)
+        freed = freedom.apply(problem, None)
+        free = estimate_covariances(freed, options, of_shape=True, **freedom.overrides())
+        noise, drift = np.nan_to_num(free.centers), _drift(images, after.images)
     except UnsolvableError:
         return None
-    more = excess(free.centers, held.centers) + drift
-    every = np.nan_to_num(free.centers) + drift
-    return LeftOpen(more[images.frame_of], every[images.frame_of])
+    left_open: FloatArray = noise + excess(drift, noise)
+    return left_open[images.frame_of]
 
 
 def _unmeasured(lens: Lens) -> Lens:

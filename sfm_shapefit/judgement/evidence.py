@@ -226,18 +226,18 @@ class OpenShape(NamedTuple):
     """What the points leave open of a model's shape, see `adjustment.open_shape`."""
 
     covariances: FloatArray
-    """Covariances (n, 3, 3) of the centers, beside what noise does, in squared units; 0 without a pose."""
+    """Covariances (n, 3, 3) of the centers in squared units; 0 without a pose."""
     cameras: IntArray
-    """Rows of those whose largest standard deviation, by noise too, is above 5 % of the extent."""
+    """Rows of those whose largest standard deviation is above 5 % of the extent."""
     largest: float
     """The largest of all, as a share of the extent."""
 
     @classmethod
-    def of(cls, images: Images, rows: IntArray, more: FloatArray, every: FloatArray) -> "OpenShape":
-        """Return what is left open of the posed images, by their rows (r,); `every` is with noise."""
+    def of(cls, images: Images, rows: IntArray, left_open: FloatArray) -> "OpenShape":
+        """Return what is left open of the posed images, covariances (r, 3, 3) by their rows (r,)."""
         covariances = np.zeros((images.num_images, 3, 3))
-        covariances[rows] = more
-        sigmas = standard_deviations(every).max(axis=1) / extent_of(images.centers[rows])
+        covariances[rows] = left_open
+        sigmas = standard_deviations(left_open).max(axis=1) / extent_of(images.centers[rows])
         return cls(covariances, np.sort(rows[sigmas > RARE]), float(sigmas.max()))
 
 

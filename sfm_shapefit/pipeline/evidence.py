@@ -65,14 +65,16 @@ def gather_evidence(
         across = np.concatenate([cut.contradicting for cut in cuts])
         seams = find_seams(cuts, ask_rotations(source, across, threads), source.images.rotations)
     apart = [camera for seam in seams for camera in seam.cameras.tolist()]
-    contradicted = fits.contradicted(images)
-    doubted = np.isin(np.arange(images.num_images), [one.camera for one in contradicted])
-    sure = ask_pixels(source, structure, doubted)
+    contradicted, places = fits.contradicted(images), fits.other_places()
+    asked_of = [one.camera for one in contradicted]
+    asked_of += [] if source.has_database else [one.camera for one in places]
+    doubted = np.isin(np.arange(images.num_images), asked_of)
+    sure = ask_pixels(source, structure, doubted)  # own tracks hold no second place of who fits the first
     num_unasked = int(np.sum(source.view.num_keypoints == 0)) if source.inputs.is_made else 0
     return ModelEvidence(
         lenses=lenses,
         oddities=odd,
-        places=fits.other_places(),
+        places=tuple(one for one in places if source.has_database or not sure[one.camera]),
         seams=seams,
         contradicted=tuple(one for one in contradicted if not sure[one.camera]),
         untied=tuple(one for one in untied if 2 * np.isin(one.cameras, apart).sum() < len(one.cameras)),
@@ -96,7 +98,7 @@ def ask_shape(
         return None
     held = {"lenses_held": lenses_held, "rotations_held": rotations_held}
     found = None if all(held.values()) else estimate_open_shape(images.part(rows), tracks, **held)
-    return None if found is None else OpenShape.of(images, rows, *found)
+    return None if found is None else OpenShape.of(images, rows, found)
 
 
 def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:

@@ -18,6 +18,7 @@ from functools import partial
 
 import numpy as np
 
+from sfm_shapefit.adjustment.lens_doubts import excess
 from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.executors import nobody
@@ -74,6 +75,7 @@ from sfm_shapefit.placement.prior_fit import PriorFit, compare_with_priors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.tracks.options import NodeOptions
 
+_OPEN = 1e100  # squared units; larger covariances overflow, and mean that nothing holds a camera
 _SMALLEST_ADJUSTED = 8
 """Cameras of a further piece that is adjusted; smaller ones are placed and seeded only, for their seconds."""
 
@@ -310,10 +312,12 @@ def _ask_shape(stand: Stand, images: Images, *, lenses_held: bool) -> OpenShape 
 
 
 def _widened(judged: Judged, shape: OpenShape | None, scale: float) -> Judged:
-    """Return the piece with what its shape leaves open, `scale` from the solver's unit."""
+    """Return the piece with what its shape leaves open beyond its noise, `scale` from the solver's unit."""
     if shape is None:
         return judged
-    return replace(judged, open_covariances=shape.covariances[judged.cameras] / scale**2)
+    left_open = shape.covariances[judged.cameras] / scale**2
+    told = np.clip(judged.covariances, -_OPEN, _OPEN)  # a camera that hangs loose has huge ones
+    return replace(judged, open_covariances=excess(left_open, told))
 
 
 def _tied_by_priors(stand: Stand, images: Images) -> IntArray | None:

@@ -1,7 +1,10 @@
 """Rigs that are tiny beside their scene, seen through lenses that are guessed."""
 
 import numpy as np
+import pycolmap
 
+import sfm_shapefit
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pipeline.map import map_database
 from tests.scenes import edit_database, real_scene
 
@@ -16,3 +19,15 @@ def test_a_lens_without_distortion_that_is_guessed_is_found_before_the_rig_is_as
     focal_px = [camera.mean_focal_length() for camera in found.reconstruction.cameras.values()]
     np.testing.assert_allclose(focal_px, 129.2, rtol=0.02)  # as the maker of the rig has it
     assert any("taken to share one center" in warning for warning in found.models[0].located.warnings)
+
+
+def test_without_a_database_check_and_locate_call_a_tiny_rig_good_and_pixels_that_fit_hold_no_second_place():
+    model = pycolmap.Reconstruction(real_scene("kerry-park") / "sparse" / "0")
+    located = sfm_shapefit.locate(model)
+    verdicts = [
+        found.verdict for found in (located, *map(sfm_shapefit.check, (model, located.reconstruction)))
+    ]
+    assert [verdict.grade for verdict in verdicts] == 3 * [Grade.GOOD]
+    # The better model of the same matches; `sparse/0` is .17 units, and .36 degrees, from it.
+    better = sfm_shapefit.evaluate(located.reconstruction, real_scene("kerry-park") / "global")
+    assert better.position.median < 0.1
