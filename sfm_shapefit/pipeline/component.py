@@ -3,26 +3,24 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.map_result import MappedModel
-from sfm_shapefit.facts.result import Inputs, LocateResult
+from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.scene import Loop
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.acting import act, at_one_center
+from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.components import pairs_among
-from sfm_shapefit.pipeline.first_placement import adjust_first_placement, start_from_first
-from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource, see_matches
 from sfm_shapefit.pipeline.map_run import MapRun
-from sfm_shapefit.pipeline.rigs import find_rigid_parts
-from sfm_shapefit.pipeline.settle import settle
-from sfm_shapefit.placement.gauge import UselessPriorsError
+from sfm_shapefit.pipeline.remedies import at_one_center, make_model
+from sfm_shapefit.pipeline.starts import adjust_first_placement
+from sfm_shapefit.pipeline.state import ModelState, RunInputs
 from sfm_shapefit.placement.place import ContradictedOffsetsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -40,19 +38,23 @@ def refine_intrinsics(run: MapRun, relative: RelativeRotations) -> Images:
     """
     found, is_found = run.images, np.zeros(len(run.images.lenses), dtype=np.bool_)
     for _, members, averaging in run.average_images(relative, {}):
-        given = _given(run, run.pose(members, averaging.rotations), run.inputs)
-        source = see_matches(run.matches, given.images, run.inputs, run.options)
+        inputs = _inputs_of(run, members, averaging).without_positions()
+        source = see_matches(run.matches, inputs.images, run.inputs, run.options)
         with suppress(UnsolvableError):
-            find = partial(adjust_first_placement, options=run.options, clock=run.clock, lenses_wanted=True)
-            with run.clock("first placement"):
-                try:
-                    first = find(given, source)
-                except ContradictedOffsetsError:  # by directions of lenses that are not known yet
-                    first = find(*at_one_center(given, source))
-            adjusted, rows = first.adjusted, run.images.lenses_of(first.adjusted.images)
-            found = found.with_lenses_of(adjusted.images, adjusted.is_tried & ~is_found[rows])
-            is_found[rows] |= adjusted.is_tried
+            try:
+                first = _place_first(inputs, source, run.clock)
+            except ContradictedOffsetsError:  # by directions of lenses that are not known yet
+                first = _place_first(*at_one_center(inputs, source), run.clock)
+            rows = run.images.lenses_of(first.images)
+            found = found.with_lenses_of(first.images, first.is_tried & ~is_found[rows])
+            is_found[rows] |= first.is_tried
     return found
+
+
+def _place_first(inputs: RunInputs, source: MatchSource, clock: Clock) -> Estimate:
+    state = adjust_first_placement(ModelState.of(inputs, source), clock, lenses_wanted=True)
+    assert state.first is not None
+    return state.first
 
 
 def locate_components(
@@ -99,12 +101,12 @@ def _locate_component(
     run: MapRun, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
 ) -> LocateResult:
     """Place one component: adjust a first placement, and locate from the rotations of that."""
-    images, inputs = run.pose(members, averaging.rotations), run.inputs
+    inputs, read = _inputs_of(run, members, averaging), run.inputs
     _, among = pairs_among(relative, members)
     if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
-        inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(images, among, averaging))
-    source = replace(see_matches(run.matches, images, inputs, run.options), alone=among)
-    found = act(partial(_place, run, members), _given(run, images, inputs), source, run.options)
+        read = replace(read, left_out=read.left_out | _false_pairs(inputs.images, among, averaging))
+    source = replace(see_matches(run.matches, inputs.images, read, run.options), alone=among)
+    found = make_model(inputs, source, run.clock)
     return replace(
         found,
         scores=run.scores.of(members[found.directions.pairs]),
@@ -112,35 +114,23 @@ def _locate_component(
     )
 
 
-def _place(run: MapRun, members: IntArray, given: Given, source: MatchSource) -> LocateResult:
-    """Adjust a first placement of some images, and locate them from the rotations of that."""
-    first = None
-    if run.options.freedom.adjust != "none":
-        given, source, first = start_from_first(given, source, run.options, run.clock)
-    given = _with_told(run, given, members)
-    with run.clock("locate"):
-        try:
-            return settle(given, source, run.options, run.clock.anew(), first)
-        except UselessPriorsError as error:  # which other components need not share
-            given = given._replace(known=replace(given.known, priors=None))
-            found = settle(given, source, run.options, run.clock.anew(), first)
-            warning = f"the scale is not that of position priors: {error}"
-            return replace(found, warnings=(*found.warnings, warning))
-
-
-def _given(run: MapRun, images: Images, inputs: Inputs) -> Given:
-    """Return what is known of a component's images before they are placed: nothing that sets a scale."""
-    intrinsics = run.intrinsics.part(run.images.lenses_of(images))
-    return Given(run.read.template(images), images, intrinsics, inputs, find_rigid_parts(images), np.inf)
-
-
-def _with_told(run: MapRun, given: Given, members: IntArray) -> Given:
-    """Return what is known of a component's images with what the user told of them."""
-    names, known = set(given.images.names), run.known.of(members)
+def _inputs_of(run: MapRun, members: IntArray, averaging: AveragedRotations) -> RunInputs:
+    """Return what the models of a component's images are made by."""
+    images, known = run.pose(members, averaging.rotations), run.known.of(members)
     if known.priors is not None:  # without notes: the run says them once
         known = replace(known, priors=replace(known.priors, notes=()) if len(known.priors) else None)
-    distances = tuple(one for one in run.options.gauge.known_distance if {*one[:2]} <= names)
-    return given._replace(distances=distances, known=known)
+    names = set(images.names)
+    return RunInputs(
+        options=run.options,
+        template=run.read.template(images),
+        images=images,
+        intrinsics=run.intrinsics.part(run.images.lenses_of(images)),
+        fixed=np.zeros(len(members), dtype=np.bool_),
+        pull_rad=np.inf,
+        is_component=True,
+        distances=tuple(one for one in run.options.gauge.known_distance if {*one[:2]} <= names),
+        known=known,
+    )
 
 
 def _false_pairs(images: Images, among: RelativeRotations, averaging: AveragedRotations) -> PairNames:

@@ -1,4 +1,8 @@
-"""Which scale, origin and axes the output gets: as asked, or by what is known."""
+"""Which scale, origin and axes the output gets: as asked, or by what is known.
+
+The frame that is worked in is chosen for all cameras of a placement, and again for those that are trusted.
+The output gets its gauge in one place, `stages.set_gauge`.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -9,8 +13,10 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.geometry import Similarity, mean_rotation_l1
 from sfm_shapefit.base.wording import counted_are
 from sfm_shapefit.pipeline.rigs import Rigid
+from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.gauge import (
     FEWEST_CHECKED,
     Gauge,
@@ -25,6 +31,7 @@ from sfm_shapefit.placement.gauge import (
     unit_gauge,
 )
 from sfm_shapefit.placement.options import GaugeOptions, KnownDistance, Scale
+from sfm_shapefit.placement.prior_refinement import PULLED
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import names_among
@@ -131,6 +138,53 @@ class GaugeRule(NamedTuple):
             )
         elif self.rigid.fixed.any():
             yield "position priors have no part in origin and axes, which are those of the fixed cameras"
+
+
+def gauge_rule(state: ModelState) -> GaugeRule:
+    """Return what sets scale, origin and axes of a model."""
+    inputs = state.inputs
+    return GaugeRule(inputs.images, state.rigid, inputs.scale, inputs.known.priors, inputs.distances)
+
+
+def choose_gauge(state: ModelState) -> ModelState:
+    """Return a state in the gauge of its placed cameras that are kept, or of all; what priors hold stays."""
+    if state.held is not None:
+        return state
+    placed, kept = state.placement, slice(None) if state.kept is None else state.kept
+    gauge = gauge_rule(state).choose(placed.cameras[kept], placed.locations[kept], placed.unit)
+    return replace(state, gauge=gauge)
+
+
+def bring_to_gauge(state: ModelState) -> ModelState:
+    """Return a model with points in its gauge, found anew where it was adjusted or lost cameras.
+
+    The axes of the input are those in which the rotations agree best with the input's. What fixed cameras
+    hold of the gauge is held already.
+    """
+    lost = state.bundle is not None or (state.support.num_seen >= 0).any()
+    if not lost or state.held is not None:
+        axes = state.gauge.axes
+        return state if axes is None else state.moved(turn_about_origin(axes), state.gauge)
+    cameras, images = state.placement.cameras[state.kept], state.images
+    unit, is_fixed = None if state.placement.unit is None else 1.0, bool(state.inputs.fixed.any())
+    if is_fixed and unit is not None:
+        return state
+    given, own = state.source.images.rotations[cameras], images.rotations[cameras]
+    turn = np.eye(3) if is_fixed else mean_rotation_l1(given.transpose(0, 2, 1) @ own)
+    found = gauge_rule(state).choose(cameras, images.centers[cameras] @ turn.T, unit)
+    axes = np.eye(3) if found.axes is None else found.axes
+    scale, shift, before = found.similarity.scale, found.similarity.translation, state.gauge.similarity
+    motion = Similarity(scale=scale, rotation=axes @ turn, translation=axes @ shift)
+    moved = scale * turn @ before.translation + shift
+    similarity = replace(before, scale=scale * before.scale, translation=moved)
+    _, mark, pulled = state.gauge.statement.partition(PULLED)  # by what pulled the cameras before
+    statement = f"{found.statement}{mark}{pulled}"
+    return state.moved(motion, replace(found, similarity=similarity, statement=statement))
+
+
+def turn_about_origin(rotation: FloatArray) -> Similarity:
+    """Return the motion that only turns the world."""
+    return Similarity(scale=1.0, rotation=rotation, translation=np.zeros(3))
 
 
 def say_unused(what: str, chosen: Gauge, find: Callable[[], float]) -> str:

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.control_points import ControlPoint, control_rows, control_warnings
+from sfm_shapefit.facts.control_points import control_rows, control_warnings
 from sfm_shapefit.files.colmap.control_points import look_at_marks, read_control_points
 from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.pipeline.gauge_choice import say_unused
-from sfm_shapefit.pipeline.seed import Seeded, turn_about_origin
+from sfm_shapefit.pipeline.gauge_choice import say_unused, turn_about_origin
+from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.control_points import (
     control_gauge,
     fit_control_points,
@@ -25,7 +25,6 @@ from sfm_shapefit.placement.control_points import (
 from sfm_shapefit.rotations.options import GRAVITY_OF_DATABASE
 from sfm_shapefit.scene.given import ControlPoints, Gravity, Known, PositionPriors
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.tracks.options import StructureOptions
 
 PRIORS_OF_DATABASE = "database"
 """In place of a table or folder: the database's own pose priors."""
@@ -47,26 +46,16 @@ def read_known(
     )
 
 
-def bring_to_known(
-    seeded: Seeded, known: Known, options: StructureOptions, *, moves: bool, resize: bool
-) -> tuple[Seeded, tuple[ControlPoint, ...], list[str]]:
+def bring_to_known(state: ModelState) -> ModelState:
     """Return a model in scale and axes of control points, or with z up by gravity, where these are known.
 
-    Points that cannot tell scale and axes leave the model as it is, and so do all where the model is not to
-    move; where it may not `resize`, as its scale is known, they move and turn it. They check its scale then.
-
-    Returns:
-        The model, a row for each control point, and what to warn of.
+    Points that cannot tell scale and axes leave the model as it is, and so do all where a camera is fixed;
+    where the scale is known, they move and turn it only. They check its scale then.
     """
-    rows, warnings = list[ControlPoint](), list[str]()
+    known = state.inputs.known
     if known.control is not None:
-        seeded, rows, warnings = _bring_to_control_points(
-            seeded, known.control, options, moves=moves, resize=resize
-        )
-    if known.gravity is not None:
-        seeded, more = _turn_upright(seeded, known.gravity)
-        warnings += more
-    return seeded, tuple(rows), warnings
+        state = _bring_to_control_points(state, known.control)
+    return state if known.gravity is None else _turn_upright(state, known.gravity)
 
 
 def _read_priors(images: Images, file: DatabaseFile | None, asked: Path | str) -> PositionPriors:
@@ -92,49 +81,45 @@ def _read_gravity(images: Images, file: DatabaseFile | None, asked: str) -> Grav
     return database_gravity(file, images)
 
 
-def _bring_to_control_points(
-    seeded: Seeded, known: ControlPoints, options: StructureOptions, *, moves: bool, resize: bool
-) -> tuple[Seeded, list[ControlPoint], list[str]]:
-    """Return a model in the world of control points, a row for each point, and what to warn of."""
-    found = triangulate_control_points(known, look_at_marks(seeded.images, known), options)
+def _bring_to_control_points(state: ModelState, known: ControlPoints) -> ModelState:
+    """Return a model in the world of control points, with a row for each point."""
+    moves, resize = not state.inputs.fixed.any(), state.placement.unit is None
+    images, options = state.images, state.inputs.options.structure
+    found = triangulate_control_points(known, look_at_marks(images, known), options)
     fit = fit_control_points(known, found.positions, resize=resize or not moves)
-    warnings = list(control_warnings(known, found, fit, seeded.images.names))
+    warnings = list(control_warnings(known, found, fit, images.names))
     rows = control_rows(known, found, fit)
-    if isinstance(fit, str):
-        return seeded, rows, warnings
-    if not (moves and resize):
+    if not (isinstance(fit, str) or (moves and resize)):
         free = fit_control_points(known, found.positions)
         scale = 1.0 if isinstance(free, str) else free.motion.scale
-        warnings.append(say_unused("control points were", seeded.gauge, lambda: scale))
-    if not moves:
+        warnings.append(say_unused("control points were", state.gauge, lambda: scale))
+    if not (isinstance(fit, str) or moves):
         rows = [replace(row, use="check") for row in rows]
-        return seeded, rows, warnings
-    gauge = control_gauge(seeded.gauge, known, fit, resize=resize)
-    return seeded.moved(fit.motion, gauge), rows, warnings
+    state = replace(state.warned(*warnings), control=tuple(rows))
+    if isinstance(fit, str) or not moves:
+        return state
+    return state.moved(fit.motion, control_gauge(state.gauge, known, fit, resize=resize))
 
 
-def _turn_upright(seeded: Seeded, gravity: Gravity) -> tuple[Seeded, list[str]]:
-    """Return a model turned so that z points up, unless something else set its axes, and what to warn of."""
+def _turn_upright(state: ModelState, gravity: Gravity) -> ModelState:
+    """Return a model turned so that z points up, unless something else set its axes."""
     from sfm_shapefit.rotations.gravity import FEWEST_GRAVITIES, down_of, judge_gravity, turn_upright
 
-    images, members = seeded.images, np.flatnonzero(seeded.images.is_posed)
+    images, members = state.images, np.flatnonzero(state.images.is_posed)
     rotations, own = images.rotations[members], gravity.of(members)
     if len(own.indices) < FEWEST_GRAVITIES:
         few = f"{len(own.indices)} of the placed images have a gravity, and two are needed"
-        return seeded, [f"{few} to turn the model upright"]
+        return state.warned(f"{few} to turn the model upright")
     turn = turn_upright(down_of(rotations, own))
     off, wrong = judge_gravity(rotations @ turn.T, own)
-    warnings = []
     if wrong.any():
         worst = np.flatnonzero(wrong)[np.argsort(-off[wrong], kind="stable")]
         names = [images.names[members[own.indices[k]]] for k in worst[:_NAMED].tolist()]
-        warnings.append(
+        state = state.warned(
             f"gravities of {len(worst)} of {len(wrong)} images contradict their rotations and have no part: "
             f"{', '.join(names)}, by up to {np.degrees(off[worst[0]]):.0f} deg"
         )
-    if seeded.gauge.axes is not None:
-        return seeded, warnings
-    statement = f"{seeded.gauge.statement}; z up by {int(np.sum(~wrong))} of {len(wrong)} gravities"
-    return seeded.moved(
-        turn_about_origin(turn), replace(seeded.gauge, axes=turn, statement=statement)
-    ), warnings
+    if state.gauge.axes is not None:
+        return state
+    statement = f"{state.gauge.statement}; z up by {int(np.sum(~wrong))} of {len(wrong)} gravities"
+    return state.moved(turn_about_origin(turn), replace(state.gauge, axes=turn, statement=statement))
