@@ -53,18 +53,18 @@ def pull_cameras(state: ModelState) -> ModelState:
     Priors without a standard deviation do not pull, nor do those whose axes are not known.
     """
     known = state.inputs.known
-    if known.priors is None or known.control is not None or state.gauge.scale != "prior":
+    if known.priors is None or known.control is not None or state.frame.scale != "prior":
         return state
     priors, limited = known.priors.with_sigmas(), state.source.economy.limit(state.inputs.options.placement)
-    if not len(priors.of(state.placement.cameras)) or state.gauge.axes is None:
+    if not len(priors.of(state.placement.cameras)) or state.frame.axes is None:
         return state
     try:
-        pulled = pull_to_priors(state.placement, state.gauge, priors, limited)
+        pulled = pull_to_priors(state.placement, state.frame, priors, limited)
     except UnsolvableError as error:
         return state.failed(f"the position priors do not pull its cameras: {error}")
     frames = state.source.images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
     held = pulled.anchors._replace(indices=frames)
-    return replace(state, placement=pulled.placement, gauge=pulled.gauge, held=held)
+    return replace(state, placement=pulled.placement, frame=pulled.gauge, held=held)
 
 
 def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
@@ -82,7 +82,7 @@ def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
     freedom = replace(state.freedom_of(rows), pull_rad=state.inputs.pull_rad)
     adjusted = adjust_placement(start, links, options.structure, freedom, state.given_poses(rows))
     del links
-    similarity, centers = state.gauge.similarity, np.empty((images.num_images, 3))
+    similarity, centers = state.frame.similarity, np.empty((images.num_images, 3))
     centers[rows] = adjusted.images.centers
     locations = (centers[placement.cameras] - similarity.translation) / similarity.scale
     measured = state.measured

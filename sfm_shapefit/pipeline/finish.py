@@ -102,7 +102,6 @@ def _warnings(found: LocateResult, state: ModelState) -> Iterator[str]:
     yield from quality_warnings(found.placement, options.placement)
     yield from trust_warnings(found.placement, found.kept)
     yield from ambiguity_warnings(found.placement)
-    yield from state.warnings
     if found.model.num_points3D() == 0:
         yield f"{NO_POINTS}; bundle adjustment has nothing to start from"
     yield from prior_warnings(found.prior_fit, images.names)
@@ -112,6 +111,7 @@ def _warnings(found: LocateResult, state: ModelState) -> Iterator[str]:
         yield f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}"
     unsupported = [images.names[k] for k in np.flatnonzero(found.unsupported).tolist()]
     yield from support_warnings(unsupported, is_kept=options.trust.min_trust == 0.0)
+    yield from state.warnings
 
 
 def _compare_with_rough(found: LocateResult, state: ModelState, sigma_rad: float) -> LocateResult:

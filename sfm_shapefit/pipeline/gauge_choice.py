@@ -146,25 +146,25 @@ def gauge_rule(state: ModelState) -> GaugeRule:
     return GaugeRule(inputs.images, state.rigid, inputs.scale, inputs.known.priors, inputs.distances)
 
 
-def choose_gauge(state: ModelState) -> ModelState:
-    """Return a state in the gauge of its placed cameras that are kept, or of all; what priors hold stays."""
+def choose_frame(state: ModelState) -> ModelState:
+    """Return a state in the frame of the placed cameras that are kept, or of all; what priors hold stays."""
     if state.held is not None:
         return state
     placed, kept = state.placement, slice(None) if state.kept is None else state.kept
-    gauge = gauge_rule(state).choose(placed.cameras[kept], placed.locations[kept], placed.unit)
-    return replace(state, gauge=gauge)
+    frame = gauge_rule(state).choose(placed.cameras[kept], placed.locations[kept], placed.unit)
+    return replace(state, frame=frame)
 
 
 def bring_to_gauge(state: ModelState) -> ModelState:
-    """Return a model with points in its gauge, found anew where it was adjusted or lost cameras.
+    """Return a model with points in its gauge, chosen anew where it was bundle adjusted or lost cameras.
 
     The axes of the input are those in which the rotations agree best with the input's. What fixed cameras
     hold of the gauge is held already.
     """
+    state, frame = replace(state, gauge=state.frame), state.frame
     lost = state.bundle is not None or (state.support.num_seen >= 0).any()
     if not lost or state.held is not None:
-        axes = state.gauge.axes
-        return state if axes is None else state.moved(turn_about_origin(axes), state.gauge)
+        return state if frame.axes is None else state.moved(turn_about_origin(frame.axes), frame)
     cameras, images = state.placement.cameras[state.kept], state.images
     unit, is_fixed = None if state.placement.unit is None else 1.0, bool(state.inputs.fixed.any())
     if is_fixed and unit is not None:
@@ -173,11 +173,11 @@ def bring_to_gauge(state: ModelState) -> ModelState:
     turn = np.eye(3) if is_fixed else mean_rotation_l1(given.transpose(0, 2, 1) @ own)
     found = gauge_rule(state).choose(cameras, images.centers[cameras] @ turn.T, unit)
     axes = np.eye(3) if found.axes is None else found.axes
-    scale, shift, before = found.similarity.scale, found.similarity.translation, state.gauge.similarity
+    scale, shift, before = found.similarity.scale, found.similarity.translation, frame.similarity
     motion = Similarity(scale=scale, rotation=axes @ turn, translation=axes @ shift)
     moved = scale * turn @ before.translation + shift
     similarity = replace(before, scale=scale * before.scale, translation=moved)
-    _, mark, pulled = state.gauge.statement.partition(PULLED)  # by what pulled the cameras before
+    _, mark, pulled = frame.statement.partition(PULLED)  # what pulled the cameras before
     statement = f"{found.statement}{mark}{pulled}"
     return state.moved(motion, replace(found, similarity=similarity, statement=statement))
 

@@ -2,8 +2,7 @@
 
 A lens that is wrong is freed, a camera goes where most pairs put it, and the new model counts only if less
 speaks against it. The side of a seam is never guessed: nothing says which of two groups is wrong. Sensors
-whose offsets in their rigs are too short to tell the scale are taken to share one center, so that the scale is
-open.
+whose offsets in their rigs are too short to tell the scale are taken to share one center.
 """
 
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from sfm_shapefit.pipeline.conventions import ask_resolution
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.rigs import measure_hold
 from sfm_shapefit.pipeline.stages import run_stages
-from sfm_shapefit.pipeline.starts import begin
+from sfm_shapefit.pipeline.starts import begin_model
 from sfm_shapefit.pipeline.state import RunInputs
 from sfm_shapefit.placement.gauge import UselessPriorsError
 from sfm_shapefit.placement.place import ContradictedOffsetsError
@@ -84,7 +83,7 @@ def make_model(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateRe
 
 def _run(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateResult:
     """Return what the stages make of a source, that of `map` in a clock of its own after the start."""
-    state = begin(inputs, source, clock)
+    state = begin_model(inputs, source, clock)
     if not inputs.is_component:
         return run_stages(state, clock)
     with clock("locate"):

@@ -156,10 +156,15 @@ def place_by_checked(
     return None
 
 
-def place_with_checked(
+def place_measured(
     images: Images, graph: MeasuredGraph, measured: Measured, nodes: NodeOptions, place: Place
 ) -> list[Placement]:
-    """Return the pieces of a graph, or of that with checked points where more pairs agree with these."""
+    """Return the pieces of a graph, or of that with checked points where more pairs agree with these.
+
+    Samples of the errors of directions, which are large, are taken out of what was measured.
+    """
+    if measured.tracks is None:
+        return list(place(add_evidence(graph, measured)))
     copied = measured if measured.errors is None else replace(measured, errors=list(measured.errors))
     pieces = list(place(add_evidence(graph, copied)))
     checked = partial(build_graph, images, measured, nodes, checked=True)

@@ -1,10 +1,10 @@
 """The stages from rotations to a model, in the order in which they run; each leads from a state to a state.
 
-    begin                `starts`: rotations as given, corrected where rough, made finer where averaged
+    begin_model          `starts`: rotations as given, corrected where rough, made finer where averaged
     measure_directions   directions of all pairs, and what joins points
     place_rigid_pieces   the convex starts, refined; or, after a first placement, the certificate near it
     adjust_cameras       by priors that pull, whose gauge then stays, and by the pixels
-    judge_cameras        pairs, cameras and lenses, once; who is trusted is in the output
+    judge_piece          pairs, cameras and lenses, once; who is trusted is in the output
     seed_model           points triangulated, cameras without support left out
     set_gauge            scale, origin and axes of what is left
     examine_model        evidence that the fit did not use
@@ -30,18 +30,17 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
 from sfm_shapefit.pipeline.evidence import confirm_by_pixels, question, shape_of
 from sfm_shapefit.pipeline.finish import finish_model
-from sfm_shapefit.pipeline.gauge_choice import bring_to_gauge, choose_gauge
+from sfm_shapefit.pipeline.gauge_choice import bring_to_gauge, choose_frame
 from sfm_shapefit.pipeline.known import bring_to_known
 from sfm_shapefit.pipeline.measure import (
     Measured,
     Wanted,
-    add_evidence,
     build_graph,
     keep_within_limit,
     measure,
     wants_points,
 )
-from sfm_shapefit.pipeline.rigs import Rigid, may_be_checked, place_cameras, place_with_checked
+from sfm_shapefit.pipeline.rigs import Rigid, may_be_checked, place_cameras, place_measured
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.gauge import tell_scale
@@ -56,7 +55,7 @@ def run_stages(state: ModelState, clock: Clock) -> LocateResult:
     pieces, results = place_rigid_pieces(measure_directions(state, clock), clock), list[LocateResult]()
     while pieces:  # a piece is given up when it is finished: its samples of errors are large
         state = adjust_cameras(pieces.pop(0), clock)
-        state = judge_cameras(state, clock)
+        state = judge_piece(state, clock)
         state = seed_model(state, clock)
         state = set_gauge(state)
         state = examine_model(state, clock)
@@ -86,20 +85,16 @@ def place_rigid_pieces(state: ModelState, clock: Clock) -> list[ModelState]:
         measured = measured if economy.samples else replace(measured, errors=None)
         limited, nodes = economy.limit(options.placement), options.nodes
         place = partial(place_cameras, options=limited, nodes=nodes, clock=clock, near=state.near)
-        is_checked = measured.checks and may_be_checked(graph)
-        measured = measured if is_checked else replace(measured, tracks=None)  # which are large
+        if not (measured.checks and may_be_checked(graph)):
+            measured = replace(measured, tracks=None)  # which are large
         directions = Measured(directions=measured.directions)
         state = replace(state, source=state.source.at(images, economy), measured=directions)
-        if is_checked:
-            placements = place_with_checked(images, graph, measured, nodes, place)
-        else:
-            placements = list(place(add_evidence(graph, measured)))
-        del graph, measured
+        placements = place_measured(images, graph, measured, nodes, place)
     return [_begin_piece(state, placement) for placement in placements]
 
 
 def _begin_piece(state: ModelState, placement: Placement) -> ModelState:
-    """Return the state of one of the pieces, in the gauge of all its cameras."""
+    """Return the state of one of the pieces, in the frame of all its cameras."""
     if placement.piece:
         free = np.zeros_like(state.inputs.fixed)
         inputs = replace(state.inputs.without_positions(), fixed=free)
@@ -116,7 +111,7 @@ def _begin_piece(state: ModelState, placement: Placement) -> ModelState:
         state = state.warned(
             f"the database lacks {counted(len(names), 'image')} of the model: {first_of(names)}"
         )
-    return choose_gauge(replace(state, placement=placement))
+    return choose_frame(replace(state, placement=placement))
 
 
 def adjust_cameras(state: ModelState, clock: Clock) -> ModelState:
@@ -135,8 +130,8 @@ def adjust_cameras(state: ModelState, clock: Clock) -> ModelState:
             return state.failed(f"its cameras are not adjusted to the pixels: {error}")
 
 
-def judge_cameras(state: ModelState, clock: Clock) -> ModelState:
-    """Judge pairs and cameras where they stand, and choose who is in the output, and its gauge."""
+def judge_piece(state: ModelState, clock: Clock) -> ModelState:
+    """Judge pairs and cameras where they stand, and choose who is in the output."""
     source, relative, fit = state.source, None, state.fit_rotations
     with clock("trust"):
         if state.inputs.pull_rad != 0.0 and not fit.all():  # else the given rotations are believed
@@ -156,7 +151,7 @@ def _with_known_errors(judged: Judged, state: ModelState) -> Judged:
     """
     images = state.source.images
     if state.adjustment is not None:
-        return with_uncertainty(judged, images, state.adjustment, state.gauge.similarity.scale)
+        return with_uncertainty(judged, images, state.adjustment, state.frame.similarity.scale)
     if state.first is None or state.near is None:
         return judged
     centers = state.near.locations[judged.cameras]
@@ -168,11 +163,11 @@ def _with_known_errors(judged: Judged, state: ModelState) -> Judged:
 
 
 def _choose(state: ModelState, judged: Judged) -> ModelState:
-    """Return the state with the cameras that are trusted or fixed, in a gauge found anew for them."""
+    """Return the state with the cameras that are trusted or fixed, in a frame found anew for them."""
     kept = select_trusted(judged, state.inputs.options.trust.min_trust)
     if state.held is None:
         kept |= state.inputs.fixed[judged.cameras]
-    return choose_gauge(replace(state, placement=judged, kept=kept))
+    return choose_frame(replace(state, placement=judged, kept=kept))
 
 
 def seed_model(state: ModelState, clock: Clock) -> ModelState:
@@ -192,14 +187,14 @@ def seed_model(state: ModelState, clock: Clock) -> ModelState:
     if seeded.bundle is None:
         return seeded
     lenses = state.source.images.lenses_of(seeded.bundle.images)
-    scale = seeded.gauge.similarity.scale
+    scale = seeded.frame.similarity.scale
     judged = with_uncertainty(seeded.judged, seeded.source.images, seeded.bundle, scale)
     return replace(seeded, placement=judged, intrinsics=state.intrinsics.after(seeded.bundle, lenses))
 
 
 def set_gauge(state: ModelState) -> ModelState:
     """Bring a model with points to the scale, origin and axes of the output."""
-    state = state.warned(state.gauge.warning) if state.gauge.warning else state
+    state = state.warned(state.frame.warning) if state.frame.warning else state
     state = bring_to_known(bring_to_gauge(state))
     return replace(state, gauge=tell_scale(state.gauge, state.judged.scale_sigma))
 

@@ -30,7 +30,7 @@ from sfm_shapefit.pairs.essential import (
 )
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.gauge_choice import choose_gauge
+from sfm_shapefit.pipeline.gauge_choice import choose_frame
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import Wanted, measure, wants_points
 from sfm_shapefit.pipeline.relative_rotations import estimate_here
@@ -46,7 +46,7 @@ _LEAST_SHARE = 0.25
 """Share of the root-matches of an image's pairs that fit near its rotation; with less, it is turned."""
 
 
-def begin(inputs: RunInputs, source: MatchSource, clock: Clock) -> ModelState:
+def begin_model(inputs: RunInputs, source: MatchSource, clock: Clock) -> ModelState:
     """Return the state that directions are measured from.
 
     UnsolvableError: if a first placement is needed and no camera can be placed, or nothing triangulated.
@@ -79,7 +79,7 @@ def adjust_first_placement(
         placement = place_first(images, state.rigid, measured, options, clock)
         directions = replace(measured, tracks=None)
         del measured  # arrays of all pairs
-        placed = choose_gauge(replace(state, measured=directions, placement=placement))
+        placed = choose_frame(replace(state, measured=directions, placement=placement))
         start = placed.placed()
         rows = start.posed_rows
         adjusted = adjust_thinly(

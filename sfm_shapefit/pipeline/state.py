@@ -78,7 +78,7 @@ class RunInputs:
 
 
 _LATER: Any = None
-"""In place of what a later stage tells."""
+"""In place of what a later stage finds out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -99,10 +99,10 @@ class ModelState:
     """Directions of pairs and, until cameras are placed, what else was measured."""
     placement: Placement = _LATER
     """Where cameras stand, in the solver's units; then `judged`."""
-    gauge: Gauge = _LATER
-    """The map from the placement's locations to the frame that is worked in, which becomes the output's."""
+    frame: Gauge = _LATER
+    """The map from the placement's locations to the frame that is worked in."""
     held: KnownPositions | None = None
-    """Priors that pull at the frames and hold the gauge by that, with the weights that they ended with."""
+    """Priors that pull at image frames and hold this one by that, with the weights that they ended with."""
     adjustment: Estimate | None = None
     """How the placement was adjusted."""
     turned_deg: FloatArray | None = None
@@ -113,6 +113,8 @@ class ModelState:
     """All images where they are in the output, NaN where they are not."""
     points: Points = _LATER
     support: Support = _LATER
+    gauge: Gauge = _LATER
+    """The map from the placement's locations to the output."""
     bundle: Estimate | None = None
     """How cameras and points were bundle adjusted, if that was asked for."""
     control: tuple[ControlPoint, ...] = ()
@@ -183,7 +185,7 @@ class ModelState:
         Only the placement's cameras (k,) that are `kept` count; all if None.
         """
         chosen = np.ones(len(self.placement.cameras), dtype=np.bool_) if kept is None else kept
-        centers = self.gauge.similarity.apply(self.placement.locations[chosen])
+        centers = self.frame.similarity.apply(self.placement.locations[chosen])
         images = self.source.images
         frames = images.placed(self.placement.cameras[chosen], centers).frames
         fixed = self.inputs.fixed_frames[:, None]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,10 +12,10 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections
-from sfm_shapefit.pipeline.given import Given
+from sfm_shapefit.pipeline.gauge_choice import choose_frame
 from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
-from sfm_shapefit.pipeline.rigs import find_rigid_parts
-from sfm_shapefit.pipeline.stand import Stand
+from sfm_shapefit.pipeline.measure import Measured
+from sfm_shapefit.pipeline.state import ModelState, RunInputs
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -61,18 +62,23 @@ def placement_at(locations, pairs=None) -> Placement:
     return move_cameras(placement, np.asarray(locations))
 
 
-def stand_at(source, locations, *, all_pairs=True, pull_rad=None, **told) -> Stand:
-    """Return all images of a source at some locations, and the gauge by what is told, see `GaugeRule`."""
+def state_at(source, locations, *, options=None, all_pairs=True, pull_rad=None, **told) -> ModelState:
+    """Return all images of a source at some locations, and the frame by what is told, see `RunInputs`."""
     images, pairs = source.images, None if all_pairs else source.view.pairs
-    rigid = find_rigid_parts(images)
-    template = template_of(read_model(FOLDER))
-    known = Known(priors=told.pop("priors", None))
-    told = {"scale": "auto", "known": known, **told}
     held = np.zeros((len(images.lenses), len(PARTS)), dtype=np.bool_)
-    lenses = intrinsics_in_doubt(held, held[:, FOCAL])
-    given = Given(template, images, lenses, source.inputs, rigid, pull_rad, **told)
-    directions, placement = directions_of(images, pairs), placement_at(locations, pairs)
-    return Stand.of(given, source, directions, placement, LocateOptions())
+    inputs = RunInputs(
+        options=options or LocateOptions(),
+        template=template_of(read_model(FOLDER)),
+        images=images,
+        intrinsics=intrinsics_in_doubt(held, held[:, FOCAL]),
+        fixed=np.zeros(images.num_images, dtype=np.bool_),
+        pull_rad=pull_rad,
+        known=Known(priors=told.pop("priors", None)),
+        **{"scale": "auto", **told},
+    )
+    measured, placement = Measured(directions=directions_of(images, pairs)), placement_at(locations, pairs)
+    state = ModelState.of(inputs, source)
+    return choose_frame(replace(state, measured=measured, placement=placement))
 
 
 def directions_of(images, pairs=None) -> PairDirections:
