@@ -43,7 +43,7 @@ CHANGES = {
             "scene/given.py",
             "files/colmap/control_points.py",
             "placement/control_points.py",
-            "pipeline/known.py",
+            "pipeline/gauge_choice.py",
         },
     ),
     "a warning": Change(1, r"two ways to find lengths disagree", {"facts/warnings.py"}),

@@ -22,13 +22,17 @@ from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
-from sfm_shapefit.pipeline.gauge_choice import between_images
-from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, read_left_out, see_matches
-from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
-from sfm_shapefit.pipeline.known import read_known
+from sfm_shapefit.pipeline.gauge_choice import between_images, read_known
+from sfm_shapefit.pipeline.inputs import (
+    RunInputs,
+    choose_inputs,
+    open_matches,
+    read_left_out,
+    see_matches,
+    settle_intrinsics,
+)
 from sfm_shapefit.pipeline.remedies import make_model
 from sfm_shapefit.pipeline.rigs import read_fixed_images
-from sfm_shapefit.pipeline.state import RunInputs
 
 _ROUGH_RAD = np.radians(0.3)  # radians; directions of pairs are not measured by rotations farther off
 _NOT_CORRECTED = "rough rotations beside fixed images are not corrected; --fix needs better ones"

@@ -16,11 +16,10 @@ from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.judgement.wrong_lenses import is_like_others
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.conventions import ask_resolution
-from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
 from sfm_shapefit.pipeline.rigs import measure_hold
 from sfm_shapefit.pipeline.stages import run_stages
 from sfm_shapefit.pipeline.starts import begin_model
-from sfm_shapefit.pipeline.state import RunInputs
 from sfm_shapefit.placement.gauge import UselessPriorsError
 from sfm_shapefit.placement.place import ContradictedOffsetsError
 from sfm_shapefit.scene.lens import FOCAL, Origin

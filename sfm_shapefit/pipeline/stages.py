@@ -30,8 +30,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
 from sfm_shapefit.pipeline.evidence import confirm_by_pixels, question, shape_of
 from sfm_shapefit.pipeline.finish import finish_model
-from sfm_shapefit.pipeline.gauge_choice import bring_to_gauge, choose_frame
-from sfm_shapefit.pipeline.known import bring_to_known
+from sfm_shapefit.pipeline.gauge_choice import bring_to_gauge, bring_to_known, choose_frame
 from sfm_shapefit.pipeline.measure import (
     Measured,
     Wanted,

@@ -31,11 +31,11 @@ from sfm_shapefit.pairs.essential import (
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import choose_frame
-from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
 from sfm_shapefit.pipeline.measure import Wanted, measure, wants_points
 from sfm_shapefit.pipeline.relative_rotations import estimate_here
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_first
-from sfm_shapefit.pipeline.state import ModelState, RunInputs
+from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.place import Near
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames

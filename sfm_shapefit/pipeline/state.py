@@ -13,69 +13,23 @@ from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
-from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.files.colmap.points import ModelPictures
-from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
 from sfm_shapefit.judgement.support import Support
 from sfm_shapefit.pairs.pair_directions import PairDirections
-from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
 from sfm_shapefit.pipeline.measure import Measured
 from sfm_shapefit.pipeline.rigs import Rigid, find_rigid_parts
 from sfm_shapefit.placement.gauge import Gauge
-from sfm_shapefit.placement.options import KnownDistance, Scale
 from sfm_shapefit.placement.place import Near, Placement
-from sfm_shapefit.scene.given import NOTHING_KNOWN, Known
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.matches import is_among
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.solver.solve import refuse_admm
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RunInputs:
-    """What a model is made by beside its matches: images as they were read, options, and what the user knows.
-
-    It stays what it is from the first stage to the last.
-    """
-
-    options: PlacingOptions
-    template: Template
-    """What the images were read from."""
-    images: Images
-    """The images as they were read: what pulls, what is compared with, whose centers may set a scale."""
-    intrinsics: RefinedIntrinsics
-    """What may change of lenses in doubt."""
-    fixed: BoolArray
-    """(i,) images that keep their poses to the last bit."""
-    pull_rad: float | None
-    """Standard deviation by which an adjustment pulls rotations, see `Freedom`; None: the matches decide."""
-    rough_rad: float | None = None
-    """Standard deviation of rotations so rough that pairs correct them first; None if they are not."""
-    is_component: bool = False
-    """Whether the images are a component of `map`: a first placement makes their averaged rotations finer,
-    and position priors that set no scale are set aside."""
-    scale: Scale = "unit"
-    """The scale where nothing that is known sets it."""
-    distances: tuple[KnownDistance, ...] = ()
-    known: Known = NOTHING_KNOWN
-    """What the user knows of the images beside the matches."""
-
-    @property
-    def fixed_frames(self) -> BoolArray:
-        """Frames that keep their poses to the last bit, (f,)."""
-        fixed = np.zeros(len(self.images.frames.ids), dtype=np.bool_)
-        fixed[self.images.frame_of[self.fixed]] = True
-        return fixed
-
-    def without_positions(self) -> "RunInputs":
-        """Return the same where nothing is known of positions but what rigs say."""
-        return replace(self, scale="unit", distances=(), known=NOTHING_KNOWN)
-
 
 _LATER: Any = None
 """In place of what a later stage finds out."""

@@ -13,9 +13,9 @@ from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.gauge_choice import choose_frame
-from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
+from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, choose_inputs, open_source
 from sfm_shapefit.pipeline.measure import Measured
-from sfm_shapefit.pipeline.state import ModelState, RunInputs
+from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions

@@ -14,9 +14,8 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.reasons import Grade
-from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, see_matches
+from sfm_shapefit.pipeline.inputs import RunInputs, choose_inputs, open_matches, see_matches
 from sfm_shapefit.pipeline.remedies import find_remedies
-from sfm_shapefit.pipeline.state import RunInputs
 from tests.pipeline.test_evidence import with_own_lenses
 from tests.scenes import COURTYARD, RING
 
