@@ -9,8 +9,12 @@ import numpy as np
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.facts.intrinsics import intrinsics_in_doubt
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.judgement.support import ObservationShares, Support
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.gauge_choice import choose_frame
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, choose_inputs, open_source
@@ -79,6 +83,23 @@ def state_at(source, locations, *, options=None, all_pairs=True, pull_rad=None, 
     measured, placement = Measured(directions=directions_of(images, pairs)), placement_at(locations, pairs)
     state = ModelState.of(inputs, source)
     return choose_frame(replace(state, measured=measured, placement=placement))
+
+
+def delivered(source) -> ModelState:
+    """Return the ring as it is before its gauge is set: at its truth, with its points."""
+    model = read_model(FOLDER)
+    state = state_at(source, 0.1 * model.images.centers, all_pairs=False)
+    nobody = np.zeros(8, dtype=np.bool_)
+    return replace(
+        state,
+        placement=judge(state.placement, PlacementOptions()),
+        kept=~nobody,
+        images=model.images,
+        points=points_of(model.reconstruction, model.images),
+        support=Support(np.full(8, -1), nobody, ObservationShares(1.0, 0.0)),
+        gauge=state.frame,
+        evidence=ModelEvidence(),
+    )
 
 
 def directions_of(images, pairs=None) -> PairDirections:

@@ -21,23 +21,35 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_of_rotations, turned_deg
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import doubt_cameras
+from sfm_shapefit.pipeline.finish import finish_model
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule, gauge_rule
 from sfm_shapefit.pipeline.join import judge_joins, merge_groups
-from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, measure
+from sfm_shapefit.pipeline.measure import Measured, Wanted, add_evidence, build_graph, measure
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
-from sfm_shapefit.pipeline.stages import judge_piece, set_gauge
+from sfm_shapefit.pipeline.stages import (
+    adjust_cameras,
+    examine_model,
+    judge_piece,
+    measure_directions,
+    place_rigid_pieces,
+    seed_model,
+    set_gauge,
+)
+from sfm_shapefit.pipeline.state import ModelState
+from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Near
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.tracks.options import NodeOptions
 from tests.models import centers_of, only, posed
-from tests.pipeline.made import DATABASE, FOLDER, directions_of, opened, placement_at, state_at
+from tests.pipeline.made import DATABASE, FOLDER, delivered, directions_of, opened, placement_at, state_at
 from tests.problems import all_pairs, exact_graph, made_priors, made_rotations, turn
 from tests.scenes import view_of
 
@@ -101,6 +113,86 @@ def test_many_cameras_that_pairs_of_many_directions_hold_need_no_points(monkeypa
     assert usual.num_tracks > 10
     np.testing.assert_array_equal(own.rays, usual.rays)
     np.testing.assert_array_equal(own.offsets, usual.offsets)
+
+
+def test_measured_directions_are_those_of_the_true_cameras():
+    with opened() as source:
+        state = measure_directions(state_at(source, TRUTH.centers), Clock())
+    i, j = state.directions.pairs[state.directions.usable()].T
+    found = state.directions.directions[state.directions.usable()]
+    assert angle_between_deg(found, normalized(TRUTH.centers[i] - TRUTH.centers[j])).max() < 1e-3
+    assert state.measured.tracks is not None
+
+
+def test_a_further_piece_begins_without_what_is_known_of_positions():
+    edges = [*all_pairs(4), *all_pairs((3, 4, 5, 6, 7))]
+    with opened() as source:
+        told = {"scale": "input", "priors": made_priors(TRUTH.centers)}
+        known = replace(state_at(source, TRUTH.centers, **told).inputs, fixed=np.arange(8) == 4)
+        measured = Measured(directions=directions_of(TRUTH, edges))
+        state = replace(ModelState.of(known, source), measured=measured)
+        first, second = place_rigid_pieces(state, Clock())
+    assert [one.placement.cameras.tolist() for one in (first, second)] == [[3, 4, 5, 6, 7], [0, 1, 2, 3]]
+    assert first.inputs is known
+    assert (second.inputs.known.priors, second.inputs.scale) == (None, "unit")
+    assert not second.inputs.fixed.any()
+    for one in (first, second):
+        true = TRUTH.centers[one.placement.cameras]
+        found = one.frame.apply(one.placement.locations)
+        np.testing.assert_allclose(fit_similarity(found, true, rotate=False).apply(found), true, atol=1e-7)
+
+
+def test_adjust_leaves_what_a_first_placement_adjusted_and_says_why_a_step_is_left_out():
+    with opened() as source:
+        state = state_at(source, TRUTH.centers)
+        done = replace(state, first=SimpleNamespace())
+        assert adjust_cameras(done, Clock()) is done
+        fixed = np.ones(8, np.bool_)  # no point is seen by a camera that moves
+        still = replace(state, source=replace(source, fixed=fixed), inputs=replace(state.inputs, fixed=fixed))
+        lost = adjust_cameras(still, Clock())
+    (said,) = lost.warnings
+    assert said.startswith("its cameras are not adjusted to the pixels")
+    assert lost.adjustment is None
+    assert [one.kind for one in lost.reasons] == [Kind.FAILED]
+
+
+def test_a_camera_of_few_points_is_left_out_unless_the_pixels_confirm_it():
+    with opened() as source:
+        state = state_at(source, 0.1 * TRUTH.centers)
+        state = replace(
+            state, placement=judge(state.placement, PlacementOptions()), kept=np.ones(8, np.bool_)
+        )
+        counts = seed_points(state, Clock()).points.count_seen(8)
+        options = LocateOptions(min_points_per_image=int(counts.min()) + 1)
+        state = replace(state, inputs=replace(state.inputs, options=options))
+        once, confirmed = seed_points(state, Clock()), seed_model(state, Clock())
+    assert np.flatnonzero(~once.images.is_posed).tolist() == [counts.argmin()]
+    np.testing.assert_array_equal(confirmed.points.count_seen(8), counts)
+    assert confirmed.kept.all()
+
+
+def test_examine_finds_nothing_against_the_truth_and_a_camera_that_pairs_put_elsewhere():
+    with opened() as source:
+        state = delivered(source)
+        right = examine_model(state, Clock()).evidence
+        away = TRUTH.centers.copy()
+        away[2] += 0.3 * (TRUTH.centers[6] - TRUTH.centers[2])
+        placement = judge(move_cameras(state.placement, 0.1 * away), PlacementOptions())
+        moved = replace(state, images=TRUTH.placed(np.arange(8), away), placement=placement)
+        wrong = examine_model(moved, Clock()).evidence
+    assert (right.places, right.contradicted, right.seams) == ((), (), ())
+    assert {*(one.camera for one in wrong.places), *(one.camera for one in wrong.contradicted)} == {2}
+
+
+def test_finish_tells_the_state_and_puts_what_speaks_against_the_model_first():
+    with opened() as source:
+        state = set_gauge(delivered(source)).failed("a step is left out")
+        found = finish_model(replace(state, support=state.support._replace(num_seen=np.full(8, -1))), Clock())
+    np.testing.assert_allclose(found.placed.centers, TRUTH.centers, atol=1e-9)
+    assert found.model.num_points3D() == state.points.num_points
+    assert found.warnings[-1] == "a step is left out"
+    assert found.verdict.grade is Grade.LOOK
+    assert found.gauge.scale == "input"
 
 
 def test_place_yields_the_rigid_pieces_the_largest_first():
