@@ -107,3 +107,11 @@ def _resident_bytes() -> int:
 Int32Array = npt.NDArray[np.int32]
 UInt32Array = npt.NDArray[np.uint32]
 UInt64Array = npt.NDArray[np.uint64]
+
+
+def rank_within(labels: IntArray, *keys: IntArray) -> IntArray:
+    """Return the rank of each entry among those of its label, by the keys, the first one first."""
+    order = np.lexsort((*keys[::-1], labels))
+    ranks = np.empty(len(labels), dtype=np.int64)
+    ranks[order] = np.arange(len(order)) - np.searchsorted(labels[order], labels[order])
+    return ranks

@@ -45,6 +45,18 @@ class ObservationShares(NamedTuple):
     """The share that sees none, and most of whose matches miss the epipolar lines of the cameras."""
 
 
+class Support(NamedTuple):
+    """How the points that their matches make support images."""
+
+    num_seen: IntArray
+    """(i,) points that an image saw which was left out because they are too few, or hardly any of those that
+    its matches could make; -1 for all others."""
+    unsupported: BoolArray
+    """(i,) images hardly any of whose matches makes a point; of least trust 0 they are not left out."""
+    observations: ObservationShares
+    """Shares of keypoints matched in two other images that see a point, and that contradict the cameras."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObservationCounts:
     """Numbers of keypoints that are matched in two or more other posed images, by image; 0 without a pose."""

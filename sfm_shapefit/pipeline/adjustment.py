@@ -15,7 +15,7 @@ from sfm_shapefit.adjustment.sources import links_touching
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
-from sfm_shapefit.facts.options import PlacingOptions, Rotations
+from sfm_shapefit.facts.options import Rotations
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import Judged
@@ -25,10 +25,9 @@ from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
-from sfm_shapefit.pipeline.stand import Stand, posed_part
+from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
-from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import is_among
 
@@ -48,65 +47,65 @@ def pull_of_rotations(rotations: Rotations) -> float | None:
     return {"auto": None, "held": 0.0, "free": math.inf}[rotations]
 
 
-def pull_cameras(stand: Stand, options: PlacementOptions) -> Stand:
+def pull_cameras(state: ModelState) -> ModelState:
     """Return the cameras pulled by the priors that have set the gauge, which holds from here on.
 
     Priors without a standard deviation do not pull, nor do those whose axes are not known.
     """
-    given = stand.given
-    if given.known.priors is None or given.known.control is not None or stand.gauge.scale != "prior":
-        return stand
-    priors = given.known.priors.with_sigmas()
-    if not len(priors.of(stand.placement.cameras)) or stand.gauge.axes is None:
-        return stand
+    known = state.inputs.known
+    if known.priors is None or known.control is not None or state.frame.scale != "prior":
+        return state
+    priors, limited = known.priors.with_sigmas(), state.source.economy.limit(state.inputs.options.placement)
+    if not len(priors.of(state.placement.cameras)) or state.frame.axes is None:
+        return state
     try:
-        pulled = pull_to_priors(stand.placement, stand.gauge, priors, options)
+        pulled = pull_to_priors(state.placement, state.frame, priors, limited)
     except UnsolvableError as error:
-        return stand.failed(f"the position priors do not pull its cameras: {error}")
-    frames = stand.source.images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
+        return state.failed(f"the position priors do not pull its cameras: {error}")
+    frames = state.source.images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
     held = pulled.anchors._replace(indices=frames)
-    return stand._replace(placement=pulled.placement, gauge=pulled.gauge, held=held)
+    return replace(state, placement=pulled.placement, frame=pulled.gauge, held=held)
 
 
-def adjust_placed(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
+def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
     """Adjust all placed cameras, in the frame that is worked in, and measure their directions again there.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    images, placement, directions = stand.source.images, stand.placement, stand.directions
-    posed = posed_part(stand.place())
-    links = stand.read_links(posed, clock.advance)
-    if stand.source.fixed is not None:  # points that fixed images alone see move nothing
-        links = links_touching(posed.images, links, ~stand.source.fixed[posed.rows])
-    freedom = replace(stand.freedom.of(posed.frames, posed.lenses), pull_rad=stand.given.pull_rad)
-    adjusted = adjust_placement(posed.images, links, options.structure, freedom, stand.given_poses(posed))
+    source, placement, options = state.source, state.placement, state.inputs.options
+    images, placed = source.images, state.placed()
+    rows = placed.posed_rows
+    start, links = placed.part(rows), state.read_links(placed, clock.advance)
+    if source.fixed is not None:  # points that fixed images alone see move nothing
+        links = links_touching(start, links, ~source.fixed[rows])
+    freedom = replace(state.freedom_of(rows), pull_rad=state.inputs.pull_rad)
+    adjusted = adjust_placement(start, links, options.structure, freedom, state.given_poses(rows))
     del links
-    similarity, centers = stand.gauge.similarity, np.empty((images.num_images, 3))
-    centers[posed.rows] = adjusted.images.centers
+    similarity, centers = state.frame.similarity, np.empty((images.num_images, 3))
+    centers[rows] = adjusted.images.centers
     locations = (centers[placement.cameras] - similarity.translation) / similarity.scale
-    source = stand.source
+    measured = state.measured
     if not adjusted.freedom.holds_rotations or adjusted.is_refined.any() or adjusted.refines_sensors:
         source = source.at(images.turned(adjusted.images))
-        corrected = posed.frames[np.broadcast_to(adjusted.freedom.singled_out(), len(posed.frames))]
+        frames = np.unique(images.frame_of[rows])
+        corrected = frames[np.broadcast_to(adjusted.freedom.singled_out(), len(frames))]
         is_corrected = np.isin(images.frame_of, corrected)
-        directions = _measure_again(source, directions, is_corrected, options.directions, clock)
+        directions = _measure_again(source, state.directions, is_corrected, options.directions, clock)
+        measured = replace(measured, directions=directions)
         turns = source.images.rotations.transpose(0, 2, 1) @ images.rotations
-        measured = _turn(placement.measured, directions, turns)
+        turned = _turn(placement.measured, directions, turns)
         if adjusted.refines_sensors:  # which stand elsewhere in their frames now
-            measured = find_rigid_parts(source.images, stand.given.rigid.fixed).apply(measured)
-        placement = replace(placement, measured=measured)
-    intrinsics = stand.intrinsics.after(adjusted, posed.lenses)
-    freedom = adjusted.freedom.among(posed.frames, len(images.frames.ids))
-    return stand._replace(
+            turned = find_rigid_parts(source.images, state.rigid.fixed).apply(turned)
+        placement = replace(placement, measured=turned)
+    return replace(
+        state,
         source=source,
-        directions=directions,
+        measured=measured,
         placement=move_cameras(placement, locations),
-        freedom=replace(freedom, parts=intrinsics.parts),
-        intrinsics=intrinsics,
-        estimate=adjusted,
-        scale=similarity.scale,
+        intrinsics=state.intrinsics.after(adjusted, np.unique(images.lens_of[rows])),
         adjustment=adjusted,
+        turned_deg=turned_deg(images.rotations, source.images.rotations),
     )
 
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-import sfm_shapefit.pipeline.write  # noqa: F401  so that results have reports
+import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit import __version__
 from sfm_shapefit.adjustment.sources import collect_tracks
 from sfm_shapefit.base.arrays import BoolArray

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import rank_within
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.facts.result import LocateResult
@@ -15,7 +16,7 @@ from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.conventions import PoseFile, Recognized, recognize_convention
 from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Grade, Kind, of_model
 from sfm_shapefit.judgement.resolutions import recognize_resolution, recognize_sizes
-from sfm_shapefit.pipeline.doubts import ask_rotations, rank_within
+from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 
 _FIRST_PAIRS = 3  # pairs of each image; those with most matches are asked

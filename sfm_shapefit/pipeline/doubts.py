@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rank_within, rows_taken
 from sfm_shapefit.judgement.doubted import believe_rotations, weigh_doubts
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.turns import Doubt, find_turned, fit_as_placed, weigh_pairs
@@ -148,14 +148,6 @@ def confirm_rotations(source: MatchSource, directions: PairDirections, threads: 
     pairs = rows_taken(pairs, _weighed(directions, images.num_images))
     kinds = find_turned(pairs, images.frame_of).kinds
     return np.array([kind is Doubt.RIGHT for kind in kinds])
-
-
-def rank_within(labels: IntArray, *keys: IntArray) -> IntArray:
-    """Return the rank of each entry among those of its label, by the keys, the first one first."""
-    order = np.lexsort((*keys[::-1], labels))
-    ranks = np.empty(len(labels), dtype=np.int64)
-    ranks[order] = np.arange(len(order)) - np.searchsorted(labels[order], labels[order])
-    return ranks
 
 
 def _doubtful_pairs(directions: PairDirections, num_images: int) -> BoolArray:

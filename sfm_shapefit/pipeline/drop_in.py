@@ -13,7 +13,7 @@ from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.map import map_database, measure_run
-from sfm_shapefit.pipeline.map_run import start_run
+from sfm_shapefit.pipeline.mapping import start_run
 from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.scene.points import number_points
 

@@ -1,30 +1,39 @@
 """Ask for evidence that the fit did not use: of our own models, and of any that is looked at."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.lens_doubts import excess
 from sfm_shapefit.adjustment.open_shape import estimate_open_shape
 from sfm_shapefit.adjustment.sources import Links
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.executors import nobody
+from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.lenses import is_bogus
+from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
-from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape, PairFits
+from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape, PairFits, fit_pairs
 from sfm_shapefit.judgement.flights import find_flights
 from sfm_shapefit.judgement.lenses import find_odd_lenses
-from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED, SMALLEST_SHAPE
+from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED, RARE, SMALLEST_SHAPE
 from sfm_shapefit.judgement.seams import Seam, find_cuts, find_seams
 from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, find_hanging, links_of_pairs, rigid_groups
+from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.witnesses import are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
+from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.matches import View
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 from sfm_shapefit.tracks.links import ObservedTracks
 
+_OPEN = 1e100  # squared units; larger covariances overflow, and mean that nothing holds a camera
 _MOST_ASKED = 200  # images of a lens that are left out; each takes 1.4 ms, and a median of so many is exact
 
 
@@ -83,6 +92,67 @@ def gather_evidence(
     )
 
 
+def question(state: ModelState, clock: Clock) -> ModelEvidence:
+    """Return the evidence against a model of ours: by its pairs, the points, and those who were left out."""
+    placement, source, images = state.placement, state.source, state.images
+    centers = np.full((images.num_images, 3), np.nan)
+    centers[placement.cameras[state.kept]] = placement.locations[state.kept]
+    fits = fit_pairs(centers, state.directions)
+    points, among = state.points, images.is_posed
+    if placement.piece == 0 and source.has_database:
+        images = with_left_out(state)
+    if (others := images.is_posed & ~among).any():
+        points = points.seen_by(others, source.view.num_keypoints, source.view.links())
+    pictures = ModelPictures(images, source.view.keypoints, source.view.num_keypoints)
+    structure = Structure(points, images, pictures, among, None if source.fixed is None else ~source.fixed)
+    source = replace(source, tied=_tied_by_priors(state, images))
+    return gather_evidence(source, fits, structure, clock.threads)
+
+
+def confirm_by_pixels(state: ModelState) -> BoolArray:
+    """Return the doubted images (i,) that stand where their pixels see the points of the others."""
+    source, judged, support = state.source, state.judged, state.support
+    doubted = np.zeros(source.images.num_images, dtype=np.bool_)
+    doubted[judged.cameras] = (judged.assessment.trust < LOW_TRUST) | ~state.kept
+    doubted |= support.num_seen >= 0
+    doubted &= ~support.unsupported  # a wrong lens or so, of which its own points know more
+    if not (doubted.any() and source.has_database):
+        return np.zeros_like(doubted)
+    images = with_left_out(state)
+    pictures = ModelPictures(images, source.view.keypoints, source.view.num_keypoints)
+    return ask_pixels(source, Structure(state.points, images, pictures), doubted)
+
+
+def with_left_out(state: ModelState) -> Images:
+    """Return the delivered images, and where they are placed those that were left out."""
+    before, now = state.placed().frames.centers, state.images.frames.centers
+    there = np.isfinite(before).all(axis=1) & np.isfinite(now).all(axis=1)
+    motion = fit_similarity(before[there], now[there])
+    placed = np.where(np.isfinite(now), now, motion.apply(before))
+    return state.images.posed(state.images.frames.rotations, placed)
+
+
+def _tied_by_priors(state: ModelState, images: Images) -> IntArray | None:
+    """Return pairs (k, 2) of images that priors tie: those whose own is as certain as a camera should be."""
+    if state.held is None:
+        return None
+    centers = images.centers[images.is_posed]
+    most = RARE * float(np.linalg.norm(np.ptp(centers, axis=0)))
+    frames = state.held.indices[state.held.sigmas() <= most]
+    return rigid_strip(images, np.isin(images.frame_of, frames) & images.is_posed)
+
+
+def shape_of(state: ModelState) -> OpenShape | None:
+    """Return what own tracks leave open of the delivered images, where nothing else holds their shape."""
+    inputs, images = state.inputs, state.images
+    if state.source.has_database or state.held is not None or inputs.fixed.any():
+        return None
+    links, lenses_held = state.read_links(images, nobody), inputs.options.freedom.intrinsics == "held"
+    knows_rotations = inputs.pull_rad is not None and inputs.pull_rad < np.inf
+    rows = images.posed_rows
+    return ask_shape(images, rows, links, lenses_held=lenses_held, rotations_held=knows_rotations)
+
+
 def ask_shape(
     images: Images, rows: IntArray, tracks: Links, *, lenses_held: bool = False, rotations_held: bool = False
 ) -> OpenShape | None:
@@ -99,6 +169,13 @@ def ask_shape(
     held = {"lenses_held": lenses_held, "rotations_held": rotations_held}
     found = None if all(held.values()) else estimate_open_shape(images.part(rows), tracks, **held)
     return None if found is None else OpenShape.of(images, rows, found)
+
+
+def open_beyond_noise(state: ModelState, shape: OpenShape) -> FloatArray:
+    """Return the covariances (k, 3, 3) that a shape leaves open beyond its noise, in the solver's unit."""
+    judged, scale = state.judged, state.gauge.similarity.scale
+    told = np.clip(judged.covariances, -_OPEN, _OPEN)  # a camera that hangs loose has huge ones
+    return excess(shape.covariances[judged.cameras] / scale**2, told)
 
 
 def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:

@@ -81,7 +81,7 @@ def open_executor(name: str, workers: int) -> Iterator[Executor | None]:
     elif name == "processes":
         from multiprocessing import get_context  # spawned, because forking clashes with threads
 
-        from sfm_shapefit.pipeline.process_pool import ProcessPool
+        from sfm_shapefit.base.process_pool import ProcessPool
 
         with ProcessPool(workers, mp_context=get_context("spawn")) as pool:
             yield pool
@@ -114,7 +114,7 @@ def _dask_client(workers: int, scheduler: str) -> Iterator[Any]:
     except ModuleNotFoundError:
         raise MissingExtraError("the executor dask", "dask.distributed", "dask") from None
     if not scheduler:
-        from sfm_shapefit.pipeline.process_pool import children_are_not_interrupted
+        from sfm_shapefit.base.process_pool import children_are_not_interrupted
 
         with ExitStack() as opened:
             with _interrupts_wait(), children_are_not_interrupted():

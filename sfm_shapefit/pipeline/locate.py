@@ -6,7 +6,6 @@ Each stage is one function from values to a new value; the input is never change
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +19,20 @@ from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.listed_poses import read_source
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.template import template_of
-from sfm_shapefit.pipeline.acting import act
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
-from sfm_shapefit.pipeline.gauge_choice import between_images
-from sfm_shapefit.pipeline.given import Given
-from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, read_left_out, see_matches
-from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
-from sfm_shapefit.pipeline.known import read_known
-from sfm_shapefit.pipeline.rigs import find_rigid_parts, read_fixed_images
-from sfm_shapefit.pipeline.rough import settle_rough
-from sfm_shapefit.pipeline.settle import settle
-from sfm_shapefit.solver.solve import refuse_admm
+from sfm_shapefit.pipeline.gauge_choice import between_images, read_known
+from sfm_shapefit.pipeline.inputs import (
+    RunInputs,
+    choose_inputs,
+    open_matches,
+    read_left_out,
+    see_matches,
+    settle_intrinsics,
+)
+from sfm_shapefit.pipeline.remedies import make_model
+from sfm_shapefit.pipeline.rigs import read_fixed_images
 
 _ROUGH_RAD = np.radians(0.3)  # radians; directions of pairs are not measured by rotations farther off
 _NOT_CORRECTED = "rough rotations beside fixed images are not corrected; --fix needs better ones"
@@ -99,33 +99,28 @@ def locate(
             wanted = options.freedom.intrinsics
             images, intrinsics = settle_intrinsics(given, matches, wanted, inputs.left_out, listed)
             known = read_known(images, matches.file, priors, options.gauge.control_points)
-            rigid = find_rigid_parts(images, read_fixed_images(model, options.fix))
-            if rigid.groups is not None:
-                refuse_admm(options.placement.solver)
+            fixed = read_fixed_images(model, options.fix)
             has_database = matches.file is not None
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)
-            notes = model.notes
+            notes = (*model.notes, *matches.notes)
             del model  # whose points and keypoints are large
             source = see_matches(matches, images, inputs, options)
-            source = replace(source, fixed=rigid.fixed if rigid.fixed.any() else None)
-        told = Given(
-            template,
-            images,
-            intrinsics,
-            inputs,
-            rigid,
-            pull_of_rotations(options.rotations),
+        pull_rad = pull_of_rotations(options.rotations)
+        is_rough = pull_rad is not None and _ROUGH_RAD <= pull_rad < np.inf
+        if is_rough and fixed.any():
+            is_rough, notes = False, (_NOT_CORRECTED, *notes)
+        told = RunInputs(
+            options=options,
+            template=template,
+            images=images,
+            intrinsics=intrinsics,
+            fixed=fixed,
+            pull_rad=np.inf if is_rough else pull_rad,
+            rough_rad=pull_rad if is_rough else None,
             scale=options.gauge.scale,
             distances=options.gauge.known_distance,
             known=known,
         )
-        place = partial(settle, options=options, clock=clock)
-        sigma_rad, notes = told.pull_rad, (*notes, *matches.notes)
-        if sigma_rad is not None and _ROUGH_RAD <= sigma_rad < np.inf:
-            if rigid.fixed.any():
-                notes = (_NOT_CORRECTED, *notes)
-            else:
-                place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
         with naming_convention(source, clock.threads):
-            found = tell_convention(act(place, told, source, options), source, clock.threads)
+            found = tell_convention(make_model(told, source, clock), source, clock.threads)
         return replace(found, warnings=(*notes, *found.warnings)) if notes else found

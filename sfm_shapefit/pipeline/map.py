@@ -21,9 +21,8 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.pipeline.component import locate_components, refine_intrinsics
-from sfm_shapefit.pipeline.join_mapped import join_mapped
-from sfm_shapefit.pipeline.map_run import MapRun, start_run
+from sfm_shapefit.pipeline.join import join_mapped
+from sfm_shapefit.pipeline.mapping import MapRun, locate_components, refine_intrinsics, start_run
 from sfm_shapefit.rotations.sequences import Videos, Visit
 from sfm_shapefit.scene.lens import FOCAL
 

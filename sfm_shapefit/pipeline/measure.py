@@ -21,7 +21,7 @@ from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, 
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.memory import Workload
+from sfm_shapefit.pipeline.memory import Economy, Workload, describe_work, keep_within_memory
 from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, is_among, rows_of_pairs
@@ -239,6 +239,15 @@ def count_work(
         num_matches=int(directions.num_matches.sum()),
         num_sampled=len(usable) if source.economy.samples and is_few else 0,
     )
+
+
+def keep_within_limit(
+    graph: MeasuredGraph, source: MatchSource, measured: Measured, options: PlacingOptions
+) -> tuple[Economy, MeasuredGraph]:
+    """Return what is given up to stay below the limit of memory, and the graph then."""
+    work = count_work(source, measured.directions, options)
+    describe = partial(describe_work, work=work, options=options.placement)
+    return keep_within_memory(graph, describe, options.memory.max_memory_mb, source.economy)
 
 
 def add_evidence(graph: MeasuredGraph, measured: Measured) -> MeasuredGraph:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, rank_within
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
@@ -24,7 +24,6 @@ from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import LEAST_MATCHES, DirectionOptions
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.pipeline.doubts import rank_within
 from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.scene.matches import RayMatches, View

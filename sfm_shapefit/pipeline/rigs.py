@@ -17,7 +17,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, hand_back_memory
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.facts.options import FIX_SOLVED
+from sfm_shapefit.facts.options import FIX_SOLVED, PlacingOptions
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.groups import RigidGroups, separate
@@ -25,6 +25,7 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.verdicts import Hold, find_hold
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.measure import Measured, add_evidence, build_graph
 from sfm_shapefit.placement.gauge import coincide
 from sfm_shapefit.placement.place import Near, Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -36,7 +37,7 @@ from sfm_shapefit.tracks.options import NodeOptions
 _FITTING = 0.95  # share of pairs that agree with a placement; from here on no other is tried
 _MOST_TRIED = 5_000  # nodes; more take seconds
 
-Place = Callable[[MeasuredGraph], Iterator[Placement]]
+Place = Callable[..., Iterator[Placement]]
 
 
 class Rigid(NamedTuple):
@@ -153,6 +154,38 @@ def place_by_checked(
         if _count_agreeing(other) > _count_agreeing(usual):
             return graph, other
     return None
+
+
+def place_measured(
+    images: Images, graph: MeasuredGraph, measured: Measured, nodes: NodeOptions, place: Place
+) -> list[Placement]:
+    """Return the pieces of a graph, or of that with checked points where more pairs agree with these.
+
+    Samples of the errors of directions, which are large, are taken out of what was measured.
+    """
+    if measured.tracks is None:
+        return list(place(add_evidence(graph, measured)))
+    copied = measured if measured.errors is None else replace(measured, errors=list(measured.errors))
+    pieces = list(place(add_evidence(graph, copied)))
+    checked = partial(build_graph, images, measured, nodes, checked=True)
+    better = place_by_checked(pieces[0], checked, partial(place, certified=False))
+    return pieces if better is None else list(place(add_evidence(better[0], measured)))
+
+
+def place_first(
+    images: Images, rigid: Rigid, measured: Measured, options: PlacingOptions, clock: Clock
+) -> Placement:
+    """Return the largest piece of what was measured, by locations that are only a start."""
+    build = partial(build_graph, images, measured, options.nodes)
+    place = partial(
+        place_cameras, options=options.placement, nodes=options.nodes, clock=clock, certified=False
+    )
+    graph = rigid.apply(build())
+    placement = next(place(graph))
+    if measured.checks and may_be_checked(graph):
+        better = place_by_checked(placement, partial(build, checked=True), place)
+        placement = placement if better is None else better[1]
+    return placement
 
 
 def _count_agreeing(placement: Placement) -> int:

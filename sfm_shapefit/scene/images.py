@@ -175,6 +175,12 @@ class Images:
         return self.frames.is_posed[self.frame_of]
 
     @property
+    def posed_rows(self) -> IntArray:
+        """Images with a pose in the order of their ids, that of the sums of an adjustment, (r,)."""
+        rows = np.flatnonzero(self.is_posed)
+        return rows[np.argsort(self.ids[rows])]
+
+    @property
     def has_rigs(self) -> bool:
         """Whether any frame has several images."""
         return len(self.frames.ids) < self.num_images

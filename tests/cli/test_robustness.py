@@ -105,9 +105,9 @@ def test_a_working_folder_that_is_removed_meanwhile_is_told(tmp_path):
     script = (
         "import os, sys\nfrom sfm_shapefit.pipeline import locate as stages\n"
         "from sfm_shapefit.cli import main\n"
-        "settle = stages.settle\n"
-        "def remove(*given, **options):\n    os.rmdir(os.getcwd())\n    return settle(*given, **options)\n"
-        "stages.settle = remove\nos.chdir(sys.argv.pop(1))\nmain()"
+        "make = stages.make_model\n"
+        "def remove(*given, **options):\n    os.rmdir(os.getcwd())\n    return make(*given, **options)\n"
+        "stages.make_model = remove\nos.chdir(sys.argv.pop(1))\nmain()"
     )
     gone = tmp_path / "gone"
     gone.mkdir()

@@ -2,19 +2,24 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.facts.intrinsics import intrinsics_in_doubt
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.judgement.support import ObservationShares, Support
 from sfm_shapefit.pairs.pair_directions import PairDirections
-from sfm_shapefit.pipeline.given import Given
-from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
-from sfm_shapefit.pipeline.rigs import find_rigid_parts
-from sfm_shapefit.pipeline.stand import Stand
+from sfm_shapefit.pipeline.gauge_choice import choose_frame
+from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, choose_inputs, open_source
+from sfm_shapefit.pipeline.measure import Measured
+from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -61,18 +66,40 @@ def placement_at(locations, pairs=None) -> Placement:
     return move_cameras(placement, np.asarray(locations))
 
 
-def stand_at(source, locations, *, all_pairs=True, pull_rad=None, **told) -> Stand:
-    """Return all images of a source at some locations, and the gauge by what is told, see `GaugeRule`."""
+def state_at(source, locations, *, options=None, all_pairs=True, pull_rad=None, **told) -> ModelState:
+    """Return all images of a source at some locations, and the frame by what is told, see `RunInputs`."""
     images, pairs = source.images, None if all_pairs else source.view.pairs
-    rigid = find_rigid_parts(images)
-    template = template_of(read_model(FOLDER))
-    known = Known(priors=told.pop("priors", None))
-    told = {"scale": "auto", "known": known, **told}
     held = np.zeros((len(images.lenses), len(PARTS)), dtype=np.bool_)
-    lenses = intrinsics_in_doubt(held, held[:, FOCAL])
-    given = Given(template, images, lenses, source.inputs, rigid, pull_rad, **told)
-    directions, placement = directions_of(images, pairs), placement_at(locations, pairs)
-    return Stand.of(given, source, directions, placement, LocateOptions())
+    inputs = RunInputs(
+        options=options or LocateOptions(),
+        template=template_of(read_model(FOLDER)),
+        images=images,
+        intrinsics=intrinsics_in_doubt(held, held[:, FOCAL]),
+        fixed=np.zeros(images.num_images, dtype=np.bool_),
+        pull_rad=pull_rad,
+        known=Known(priors=told.pop("priors", None)),
+        **{"scale": "auto", **told},
+    )
+    measured, placement = Measured(directions=directions_of(images, pairs)), placement_at(locations, pairs)
+    state = ModelState.of(inputs, source)
+    return choose_frame(replace(state, measured=measured, placement=placement))
+
+
+def delivered(source) -> ModelState:
+    """Return the ring as it is before its gauge is set: at its truth, with its points."""
+    model = read_model(FOLDER)
+    state = state_at(source, 0.1 * model.images.centers, all_pairs=False)
+    nobody = np.zeros(8, dtype=np.bool_)
+    return replace(
+        state,
+        placement=judge(state.placement, PlacementOptions()),
+        kept=~nobody,
+        images=model.images,
+        points=points_of(model.reconstruction, model.images),
+        support=Support(np.full(8, -1), nobody, ObservationShares(1.0, 0.0)),
+        gauge=state.frame,
+        evidence=ModelEvidence(),
+    )
 
 
 def directions_of(images, pairs=None) -> PairDirections:

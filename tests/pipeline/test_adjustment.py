@@ -1,8 +1,5 @@
 """Placed cameras adjusted to the pixels, with the given rotations held, weighted or free."""
 
-from types import SimpleNamespace
-from typing import Any, NamedTuple
-
 import numpy as np
 import pycolmap
 import pytest
@@ -13,7 +10,6 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.reasons import Grade
-from sfm_shapefit.pipeline.settle import _start
 from tests.models import posed
 from tests.scenes import COURTYARD, RING, copied, edit_database
 
@@ -127,29 +123,9 @@ def test_an_adjustment_that_fails_is_a_warning_and_no_model_without_it_is_good(m
         raise UnsolvableError("no 3D point can be triangulated")
 
     assert ring_located.verdict.grade is Grade.GOOD
-    monkeypatch.setattr("sfm_shapefit.pipeline.settle.adjust_placed", fail)
+    monkeypatch.setattr("sfm_shapefit.pipeline.stages.adjust_placed", fail)
     found = sfm_shapefit.locate(RING / "sparse" / "0")
     said = "its cameras are not adjusted to the pixels: no 3D point can be triangulated"
     assert said in found.warnings
     assert found.verdict.grade is Grade.LOOK
     assert said in found.verdict.reasons
-
-
-class _Stand(NamedTuple):
-    """What of a stand tells the scale of a first placement."""
-
-    placement: Any
-    estimate: Any = None
-    scale: float = 1.0
-
-
-def test_a_camera_without_a_place_at_first_does_not_take_the_scale_of_all_errors_with_it():
-    """Without it, those of all were those of the pairs' noise: 40 times too small with guessed lenses."""
-    before = np.random.default_rng(0).standard_normal((8, 3))
-    before[5] = np.nan
-    cameras = np.array([0, 1, 2, 3, 5, 6])
-    here = 4.0 * np.nan_to_num(before[cameras])
-    stand = _Stand(SimpleNamespace(cameras=cameras, locations=here))
-    found = _start(stand, SimpleNamespace(near=SimpleNamespace(locations=before), adjusted="known"))
-    assert (found.estimate, found.scale) == ("known", pytest.approx(0.25, rel=1e-12))
-    assert _start(stand, None) is stand

@@ -12,7 +12,7 @@ import sfm_shapefit
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pipeline import evidence, settle
+from sfm_shapefit.pipeline import evidence
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.checked import check_source
 from sfm_shapefit.pipeline.clock import Clock
@@ -201,9 +201,9 @@ def test_priors_that_are_as_certain_as_cameras_tie_these(tmp_path, monkeypatch, 
     sigma = share * np.linalg.norm(np.ptp(images.centers, axis=0))
     off = 0.1 * sigma * np.random.default_rng(0).standard_normal(images.centers.shape)
     priors = write_priors(tmp_path / "priors.txt", by_name(images, images.centers + off), sigma)
-    gather = settle.gather_evidence
+    gather = evidence.gather_evidence
     monkeypatch.setattr(
-        settle, "gather_evidence", lambda *given: told.append(given[0].tied) or gather(*given)
+        evidence, "gather_evidence", lambda *given: told.append(given[0].tied) or gather(*given)
     )
     sfm_shapefit.locate(RING / "sparse" / "0", priors=priors)
     assert len(np.unique(told[0])) == num_tied

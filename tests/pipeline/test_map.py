@@ -18,10 +18,10 @@ from sfm_shapefit.facts.scene import describe_line, describe_loops
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.pair_list import read_pair_list
-from sfm_shapefit.pipeline import relative_rotations, settle
+from sfm_shapefit.pipeline import evidence, relative_rotations
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.first_placement import adjust_first_placement
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
+from sfm_shapefit.pipeline.starts import adjust_first_placement
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from sfm_shapefit.report.results import draw_joined
@@ -127,7 +127,7 @@ def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_
     table = write_priors(tmp_path / "priors.txt", by_name(truth, positions))
     path = changed(RING, tmp_path, f"{PAIRS} {ACROSS}")
     first = Mock(wraps=adjust_first_placement)
-    monkeypatch.setattr("sfm_shapefit.pipeline.first_placement.adjust_first_placement", first)
+    monkeypatch.setattr("sfm_shapefit.pipeline.starts.adjust_first_placement", first)
     found = sfm_shapefit.map_database(path, priors=table, join="never", **FAST)
     assert "join" not in found.timings_s
     assert first.call_count == 2  # priors that are given up leave what came before them
@@ -189,7 +189,7 @@ def test_images_that_see_few_points_are_left_out_with_the_reason_unless_pixels_c
     found = sfm_shapefit.map_database(RING / "database.db", min_points_per_image=limit).models[0].located
     assert found.few_points == {}
     assert {image.name: image.num_points3D for image in found.reconstruction.images.values()} == counts
-    monkeypatch.setattr(settle, "ask_pixels", lambda *given: np.zeros_like(given[-1]))
+    monkeypatch.setattr(evidence, "ask_pixels", lambda *given: np.zeros_like(given[-1]))
     out = tmp_path / "out"
     told = run("map", RING / "database.db", out, "--min-points-per-image", limit, "--json", code=0).stdout
     # The others have enough without the observations that the poorest takes along.
@@ -333,7 +333,7 @@ def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowh
         kept = far | (found.pairs[:, 1] - found.pairs[:, 0] <= 3)
         return dataclasses.replace(found, rotations=rotations, num_matches=counts).subset(kept)
 
-    monkeypatch.setattr("sfm_shapefit.pipeline.map_run.measure_rotations", with_a_false_loop)
+    monkeypatch.setattr("sfm_shapefit.pipeline.mapping.measure_rotations", with_a_false_loop)
     found = sfm_shapefit.map_database(database, sequence="names", **FAST)
     (loop,) = found.models[0].located.loops
     names = found.models[0].names

@@ -191,7 +191,7 @@ def test_what_is_given_up_is_what_the_warning_says(workspaces, kind, monkeypatch
         sampled.append(measured.errors)
         return add_evidence(graph, measured)
 
-    monkeypatch.setattr("sfm_shapefit.pipeline.settle.add_evidence", listen)
+    monkeypatch.setattr("sfm_shapefit.pipeline.rigs.add_evidence", listen)
     full = sfm_shapefit.inspect(workspaces[kind]).expected
     for limit in range(int(full.peak_mb) - 1, 200, -5):
         try:

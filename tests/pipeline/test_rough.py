@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit.adjustment import run as steps
 from sfm_shapefit.facts.warnings import rotation_warnings, wrong_rotations
-from sfm_shapefit.pipeline import rough
+from sfm_shapefit.pipeline import starts
 from sfm_shapefit.pipeline.convert import convert
 from tests.models import posed
 from tests.scenes import BUNDLED, COURTYARD, PHOTOGRAPHED, RING, edit_database
@@ -39,14 +39,14 @@ def tried():
 
 @pytest.fixture(scope="module")
 def found(spoiled, tried):
-    estimate = rough.estimate_relative_rotations
+    estimate = starts.estimate_relative_rotations
 
     def note(batch, *args, **known):
         tried.append(batch.pairs)
         return estimate(batch, *args, **known)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rough, "estimate_relative_rotations", note)
+        patch.setattr(starts, "estimate_relative_rotations", note)
         return sfm_shapefit.locate(spoiled, DATABASE, rotations=2.0)
 
 
@@ -125,7 +125,7 @@ def test_moved_is_not_told_where_the_given_centers_are_no_places(spoiled):
 
 
 def test_a_sigma_of_tenths_of_a_degree_and_fixed_images_go_the_usual_way(monkeypatch, tmp_path):
-    monkeypatch.setattr("sfm_shapefit.pipeline.locate.settle_rough", None)
+    monkeypatch.setattr("sfm_shapefit.pipeline.starts.measure_near", None)
     sfm_shapefit.locate(RING / "sparse/0", rotations=0.2)
     (tmp_path / "names.txt").write_text("0001.jpg\n0002.jpg\n")
     found = sfm_shapefit.locate(RING / "sparse/0", rotations=2.0, fix=str(tmp_path / "names.txt"))

@@ -1,6 +1,7 @@
 """Each stage of the pipeline alone: from the ring as it stands, or a little off, not from other stages."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -20,21 +21,35 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_of_rotations, turned_deg
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import doubt_cameras
-from sfm_shapefit.pipeline.gauge_choice import GaugeRule
+from sfm_shapefit.pipeline.finish import finish_model
+from sfm_shapefit.pipeline.gauge_choice import GaugeRule, gauge_rule
 from sfm_shapefit.pipeline.join import judge_joins, merge_groups
-from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, measure
+from sfm_shapefit.pipeline.measure import Measured, Wanted, add_evidence, build_graph, measure
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
+from sfm_shapefit.pipeline.stages import (
+    adjust_cameras,
+    examine_model,
+    judge_piece,
+    measure_directions,
+    place_rigid_pieces,
+    seed_model,
+    set_gauge,
+)
+from sfm_shapefit.pipeline.state import ModelState
+from sfm_shapefit.placement.move import move_cameras
+from sfm_shapefit.placement.place import Near
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.tracks.options import NodeOptions
 from tests.models import centers_of, only, posed
-from tests.pipeline.made import DATABASE, FOLDER, directions_of, opened, placement_at, stand_at
+from tests.pipeline.made import DATABASE, FOLDER, delivered, directions_of, opened, placement_at, state_at
 from tests.problems import all_pairs, exact_graph, made_priors, made_rotations, turn
 from tests.scenes import view_of
 
@@ -100,6 +115,86 @@ def test_many_cameras_that_pairs_of_many_directions_hold_need_no_points(monkeypa
     np.testing.assert_array_equal(own.offsets, usual.offsets)
 
 
+def test_measured_directions_are_those_of_the_true_cameras():
+    with opened() as source:
+        state = measure_directions(state_at(source, TRUTH.centers), Clock())
+    i, j = state.directions.pairs[state.directions.usable()].T
+    found = state.directions.directions[state.directions.usable()]
+    assert angle_between_deg(found, normalized(TRUTH.centers[i] - TRUTH.centers[j])).max() < 1e-3
+    assert state.measured.tracks is not None
+
+
+def test_a_further_piece_begins_without_what_is_known_of_positions():
+    edges = [*all_pairs(4), *all_pairs((3, 4, 5, 6, 7))]
+    with opened() as source:
+        told = {"scale": "input", "priors": made_priors(TRUTH.centers)}
+        known = replace(state_at(source, TRUTH.centers, **told).inputs, fixed=np.arange(8) == 4)
+        measured = Measured(directions=directions_of(TRUTH, edges))
+        state = replace(ModelState.of(known, source), measured=measured)
+        first, second = place_rigid_pieces(state, Clock())
+    assert [one.placement.cameras.tolist() for one in (first, second)] == [[3, 4, 5, 6, 7], [0, 1, 2, 3]]
+    assert first.inputs is known
+    assert (second.inputs.known.priors, second.inputs.scale) == (None, "unit")
+    assert not second.inputs.fixed.any()
+    for one in (first, second):
+        true = TRUTH.centers[one.placement.cameras]
+        found = one.frame.apply(one.placement.locations)
+        np.testing.assert_allclose(fit_similarity(found, true, rotate=False).apply(found), true, atol=1e-7)
+
+
+def test_adjust_leaves_what_a_first_placement_adjusted_and_says_why_a_step_is_left_out():
+    with opened() as source:
+        state = state_at(source, TRUTH.centers)
+        done = replace(state, first=SimpleNamespace())
+        assert adjust_cameras(done, Clock()) is done
+        fixed = np.ones(8, np.bool_)  # no point is seen by a camera that moves
+        still = replace(state, source=replace(source, fixed=fixed), inputs=replace(state.inputs, fixed=fixed))
+        lost = adjust_cameras(still, Clock())
+    (said,) = lost.warnings
+    assert said.startswith("its cameras are not adjusted to the pixels")
+    assert lost.adjustment is None
+    assert [one.kind for one in lost.reasons] == [Kind.FAILED]
+
+
+def test_a_camera_of_few_points_is_left_out_unless_the_pixels_confirm_it():
+    with opened() as source:
+        state = state_at(source, 0.1 * TRUTH.centers)
+        state = replace(
+            state, placement=judge(state.placement, PlacementOptions()), kept=np.ones(8, np.bool_)
+        )
+        counts = seed_points(state, Clock()).points.count_seen(8)
+        options = LocateOptions(min_points_per_image=int(counts.min()) + 1)
+        state = replace(state, inputs=replace(state.inputs, options=options))
+        once, confirmed = seed_points(state, Clock()), seed_model(state, Clock())
+    assert np.flatnonzero(~once.images.is_posed).tolist() == [counts.argmin()]
+    np.testing.assert_array_equal(confirmed.points.count_seen(8), counts)
+    assert confirmed.kept.all()
+
+
+def test_examine_finds_nothing_against_the_truth_and_a_camera_that_pairs_put_elsewhere():
+    with opened() as source:
+        state = delivered(source)
+        right = examine_model(state, Clock()).evidence
+        away = TRUTH.centers.copy()
+        away[2] += 0.3 * (TRUTH.centers[6] - TRUTH.centers[2])
+        placement = judge(move_cameras(state.placement, 0.1 * away), PlacementOptions())
+        moved = replace(state, images=TRUTH.placed(np.arange(8), away), placement=placement)
+        wrong = examine_model(moved, Clock()).evidence
+    assert (right.places, right.contradicted, right.seams) == ((), (), ())
+    assert {*(one.camera for one in wrong.places), *(one.camera for one in wrong.contradicted)} == {2}
+
+
+def test_finish_tells_the_state_and_puts_what_speaks_against_the_model_first():
+    with opened() as source:
+        state = set_gauge(delivered(source)).failed("a step is left out")
+        found = finish_model(replace(state, support=state.support._replace(num_seen=np.full(8, -1))), Clock())
+    np.testing.assert_allclose(found.placed.centers, TRUTH.centers, atol=1e-9)
+    assert found.model.num_points3D() == state.points.num_points
+    assert found.warnings[-1] == "a step is left out"
+    assert found.verdict.grade is Grade.LOOK
+    assert found.gauge.scale == "input"
+
+
 def test_place_yields_the_rigid_pieces_the_largest_first():
     edges = [*all_pairs(4), *all_pairs((3, 4, 5, 6, 7))]
     measured = MeasuredGraph(exact_graph(TRUTH.centers, edges))
@@ -127,23 +222,24 @@ def test_adjust_moves_cameras_and_free_rotations_to_where_the_pixels_are_and_mea
     )
     with opened(off) as source:
         away = TRUTH.centers + 0.004 * rng.standard_normal((8, 3))
-        stand = stand_at(source, 0.1 * away, all_pairs=False, pull_rad=pull_rad)
-        after = adjust_placed(stand, LocateOptions(), Clock())
-    found = stand.gauge.similarity.apply(after.placement.locations)
+        state = state_at(source, 0.1 * away, all_pairs=False, pull_rad=pull_rad)
+        after = adjust_placed(state, Clock())
+    found = state.frame.similarity.apply(after.placement.locations)
     fit = fit_similarity(found, TRUTH.centers, rotate=pull_rad > 0.0)
     np.testing.assert_allclose(fit.apply(found), TRUTH.centers, atol=1e-4)
-    assert after.estimate is after.adjustment
-    assert after.estimate.freedom.holds_rotations == (pull_rad == 0.0)
+    assert after.adjustment.freedom.holds_rotations == (pull_rad == 0.0)
     if pull_rad == 0.0:
-        assert after.source is source
-        assert after.directions is stand.directions
-        np.testing.assert_array_equal(after.estimate.images.frames.rotations, source.images.frames.rotations)
+        assert after.source is state.source
+        assert after.directions is state.directions
+        np.testing.assert_array_equal(
+            after.adjustment.images.frames.rotations, source.images.frames.rotations
+        )
         return
     rotations = after.source.images.rotations @ fit.rotation.T
     assert rotation_angles_deg(rotations @ TRUTH.rotations.transpose(0, 2, 1)).max() < 1e-3
     i, j = after.directions.pairs.T
     true = normalized(TRUTH.centers[i] - TRUTH.centers[j]) @ fit.rotation
-    off_deg = [angle_between_deg(one.directions, true) for one in (stand.directions, after.directions)]
+    off_deg = [angle_between_deg(one.directions, true) for one in (state.directions, after.directions)]
     assert np.median(off_deg[0]) > 0.01
     assert off_deg[1].max() < 1e-3
 
@@ -156,8 +252,8 @@ def test_adjust_turns_cameras_as_far_as_was_asked():
     with opened(off) as source:
         for rotations in ("held", 1e-4, 0.03, "free"):
             pull_rad = pull_of_rotations(rotations)
-            stand = stand_at(source, 0.1 * TRUTH.centers, all_pairs=False, pull_rad=pull_rad)
-            after = adjust_placed(stand, LocateOptions(), Clock())
+            state = state_at(source, 0.1 * TRUTH.centers, all_pairs=False, pull_rad=pull_rad)
+            after = adjust_placed(state, Clock())
             turned = turned_deg(source.images.rotations, after.source.images.rotations)
             found[rotations] = after.adjustment.statement, np.median(turned)
             assert after.adjustment.errors is None  # how far they are off is no question
@@ -188,15 +284,34 @@ def test_judge_names_the_pairs_that_contradict_and_who_is_turned_by_what_its_pai
     assert doubt_cameras(placement, directions, None, TRUTH).assessment.doubts is None
 
 
+def test_judge_takes_errors_from_a_first_placement_in_the_scale_of_the_cameras_that_had_places_then():
+    """The places of one camera are not known; with it all errors would be those of the pairs' noise."""
+    before = 4.0 * TRUTH.centers
+    before[5] = np.nan
+    with opened() as source:
+        state = state_at(source, 0.1 * TRUTH.centers, pull_rad=0.0)
+        rows = np.flatnonzero(np.arange(8) != 5)
+        known = np.tile(np.diag([1.0, 4.0, 9.0]), (7, 1, 1))
+        first = SimpleNamespace(
+            images=TRUTH.part(rows), covariances=known, lens_errors=None, scale_sigma=None
+        )
+        after = judge_piece(replace(state, near=Near(before, None), first=first), Clock())
+        bare = judge_piece(state, Clock())
+    np.testing.assert_allclose(after.judged.adjusted_covariances[rows], known / 40.0**2, rtol=1e-9)
+    assert np.isnan(after.judged.adjusted_covariances[5]).all()
+    assert bare.judged.adjusted_covariances is None
+    assert after.kept.all()
+
+
 def test_seed_has_the_points_that_kept_cameras_see_and_leaves_the_others_unregistered():
     kept = np.arange(8) != 2
     with opened() as source:
-        stand = stand_at(source, 0.1 * TRUTH.centers)
-        every = seed_points(stand, np.ones(8, np.bool_), LocateOptions(), Clock())
-        some = seed_points(stand, kept, LocateOptions(), Clock())
+        state = state_at(source, 0.1 * TRUTH.centers)
+        every = seed_points(state, Clock())
+        some = seed_points(replace(state, kept=kept), Clock())
     np.testing.assert_allclose(every.images.centers, TRUTH.centers, atol=1e-9)
-    assert every.adjusted is None
-    assert (every.num_seen == -1).all()
+    assert every.bundle is None
+    assert (every.support.num_seen == -1).all()
     assert every.points.errors_px.max() < 1e-2  # keypoints are stored as float32
     assert every.points.num_points > some.points.num_points > 200
     np.testing.assert_array_equal(some.images.is_posed, kept)
@@ -255,11 +370,13 @@ def test_seed_has_the_scale_the_origin_and_the_axes_that_are_told_also_where_all
         FOLDER, lambda _name, turn, center: (turn, 3.0 * (center + 0.5 * rng.standard_normal(3)) + 5.0)
     )
     with opened(given) as source:
-        stand = stand_at(source, 0.1 * TRUTH.centers, **told)
-        found = seed_points(stand, np.ones(8, np.bool_), LocateOptions(adjust=adjust), Clock())
-    assert (found.adjusted is not None) == (adjust == "full")
+        state = state_at(source, 0.1 * TRUTH.centers, options=LocateOptions(adjust=adjust), **told)
+        placement = judge(state.placement, PlacementOptions())
+        state = replace(state, placement=placement, kept=np.ones(8, np.bool_))
+        found = set_gauge(seed_points(state, Clock()))
+    assert (found.bundle is not None) == (adjust == "full")
     centers = found.images.centers
-    again = stand.given.rule.choose(np.arange(8), centers, None)  # what is told holds already
+    again = gauge_rule(state).choose(np.arange(8), centers, None)  # what is told holds already
     assert again.scale == found.gauge.scale
     axes = np.eye(3) if found.gauge.axes is None else found.gauge.axes
     exact = 1e-4 if told is TURNED_PRIORS else 1e-9  # a robust fit is no fixed point after twenty rounds
@@ -268,7 +385,7 @@ def test_seed_has_the_scale_the_origin_and_the_axes_that_are_told_also_where_all
     np.testing.assert_allclose(axes, TURN if told is TURNED_PRIORS else np.eye(3), atol=0.02)
     turned = TRUTH.rotations.transpose(0, 2, 1) @ found.images.rotations @ axes
     np.testing.assert_allclose(mean_rotation_l1(turned), np.eye(3), atol=1e-9)
-    near = found.gauge.apply(stand.placement.locations)
+    near = found.gauge.apply(state.placement.locations)
     assert np.abs(near - centers).max() < 0.01 * np.ptp(centers)
 
 

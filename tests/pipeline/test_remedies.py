@@ -14,10 +14,8 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.reasons import Grade
-from sfm_shapefit.pipeline.acting import find_remedy
-from sfm_shapefit.pipeline.given import Given
-from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, see_matches
-from sfm_shapefit.pipeline.rigs import Rigid
+from sfm_shapefit.pipeline.inputs import RunInputs, choose_inputs, open_matches, see_matches
+from sfm_shapefit.pipeline.remedies import find_remedies
 from tests.pipeline.test_evidence import with_own_lenses
 from tests.scenes import COURTYARD, RING
 
@@ -77,15 +75,16 @@ def test_a_camera_goes_where_twice_as_many_pairs_put_it(ring_located, here, move
     opened, inputs = open_matches(model, inputs)
     with closing(opened) as matches:
         source = see_matches(matches, model.images, inputs, options)
-        remedy = find_remedy(found, given_of(found, inputs), source, options)
-        assert (remedy is not None) == moves
-        if moves:
+        remedies = list(find_remedies(found, inputs_of(found), source))
+        assert len(remedies) == moves
+        for remedy in remedies:
             names = model.images.names
             assert remedy.source.inputs.left_out == {(names[i], names[j]) for i, j in pairs.tolist()}
             assert remedy.source.view.num_pairs == source.view.num_pairs - here
-            assert remedy.told(found)[-1].startswith(names[2])
+            assert remedy.applied(found).warnings[0].startswith(names[2])
 
 
-def given_of(found, inputs):
-    rigid = Rigid(np.zeros(found.images.num_images, dtype=bool), None, None)
-    return Given(None, found.images, found.intrinsics, inputs, rigid, None)
+def inputs_of(found):
+    fixed = np.zeros(found.images.num_images, dtype=bool)
+    known = {"images": found.images, "intrinsics": found.intrinsics, "fixed": fixed}
+    return RunInputs(options=found.options, template=None, pull_rad=None, **known)

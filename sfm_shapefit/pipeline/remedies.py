@@ -1,0 +1,170 @@
+"""Models made, and once more where evidence against them can be acted on safely.
+
+A lens that is wrong is freed, a camera goes where most pairs put it, and the new model counts only if less
+speaks against it. The side of a seam is never guessed: nothing says which of two groups is wrong. Sensors
+whose offsets in their rigs are too short to tell the scale are taken to share one center.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.judgement.limits import OUTNUMBERED
+from sfm_shapefit.judgement.wrong_lenses import is_like_others
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.conventions import ask_resolution
+from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
+from sfm_shapefit.pipeline.rigs import measure_hold
+from sfm_shapefit.pipeline.stages import run_stages
+from sfm_shapefit.pipeline.starts import begin_model
+from sfm_shapefit.placement.gauge import UselessPriorsError
+from sfm_shapefit.placement.place import ContradictedOffsetsError
+from sfm_shapefit.scene.lens import FOCAL, Origin
+
+_OPEN_SCALE = 0.5  # relative standard deviation; with a larger one the offsets may as well be 0
+_SHORT = 2e-3  # baselines; an offset as short turns a direction by a tenth of a degree, as its errors do
+
+
+class Remedy(NamedTuple):
+    """What to start from in place of what evidence speaks against."""
+
+    inputs: RunInputs
+    source: MatchSource
+    freed: dict[int, float]
+    """Rows of the lenses that may change now, and start from the focal length that their images ask for; with
+    the standard deviation of that, a share, which the roughness of poses widens."""
+    moved: tuple[str, ...]
+    """Names of cameras whose pairs for this place are left out, as twice as many agree on another."""
+
+    def cures(self, after: LocateResult, before: LocateResult) -> bool:
+        """Return whether less speaks against a result than before, with lenses known and no camera lost."""
+        less, images = _count(after) < _count(before), after.images
+        open_ = after.intrinsics.undetermined[list(self.freed)].any()
+        alike = all(is_like_others(images, k, images.lenses[k].focal_px, s) for k, s in self.freed.items())
+        return bool(less and alike and not open_ and after.kept.sum() >= before.kept.sum())
+
+    def applied(self, found: LocateResult) -> LocateResult:
+        """Return a result of this remedy, which says so; a freed lens is as uncertain as its images are."""
+        sigmas = found.intrinsics.focal_sigmas.copy()
+        for row, sigma in self.freed.items():
+            sigmas[row] = np.maximum(sigmas[row], sigma)
+        found = replace(found, intrinsics=replace(found.intrinsics, focal_sigmas=sigmas))
+        ids = {found.placed.lenses[row].id for row in self.freed}
+        lenses = (row.statement for row in found.intrinsics.rows(found.placed) if row.camera in ids)
+        done = [
+            f"{lens}: its images contradicted what was given, unless --intrinsics held" for lens in lenses
+        ]
+        if self.moved:
+            done.append(f"{', '.join(self.moved)}: placed without the pairs that twice as many contradict")
+        return replace(found, warnings=(*done, *found.warnings))
+
+
+def make_model(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateResult:
+    """Return what the stages make of a source, by a remedy if that cures what speaks against the result.
+
+    Raises:
+        UnsolvableError: if no camera can be placed.
+    """
+    found, told = _run_in_scale(inputs, source, clock), tuple[str, ...]()
+    if isinstance(found, str):
+        inputs, source = at_one_center(inputs, source)
+        told, found = (found,), _run(inputs, source, clock)
+    for remedy in find_remedies(found, inputs, source):
+        again = _run(remedy.inputs, remedy.source, clock)
+        if remedy.cures(again, found):
+            found = remedy.applied(again)
+            break
+    return replace(found, warnings=(*told, *found.warnings))
+
+
+def _run(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateResult:
+    """Return what the stages make of a source, that of `map` in a clock of its own after the start."""
+    state = begin_model(inputs, source, clock)
+    if not inputs.is_component:
+        return run_stages(state, clock)
+    with clock("locate"):
+        try:
+            return run_stages(state, clock.anew())
+        except UselessPriorsError as error:  # which other components need not share
+            known = replace(inputs.known, priors=None)
+            state = state.warned(f"the scale is not that of position priors: {error}")
+            return run_stages(replace(state, inputs=replace(inputs, known=known)), clock.anew())
+
+
+def _run_in_scale(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateResult | str:
+    """Return what the stages make of a source, or why its scale is not that of the rigs, a sentence.
+
+    UnsolvableError: as `make_model`; that directions contradict offsets means nothing where these are short.
+    """
+    longest = float(np.linalg.norm(inputs.images.sensors.translations, axis=1).max(initial=0.0))
+    try:
+        found = _run(inputs, source, clock)
+        sigma = found.placement.scale_sigma
+    except ContradictedOffsetsError as error:
+        sigma = measure_hold(error.placement).scale_sigma
+        is_short = error.length > -_SHORT or sigma > _OPEN_SCALE
+        if not (longest > 0.0 and is_short):
+            raise
+        sigma = np.inf
+    if longest > 0.0 and sigma is not None and sigma > _OPEN_SCALE:
+        return (
+            f"the offsets of sensors in their rigs, at most {longest:.2g}, are too short for this scene to "
+            "tell its scale, so the sensors of a rig are taken to share one center"
+        )
+    return found
+
+
+def at_one_center(inputs: RunInputs, source: MatchSource) -> tuple[RunInputs, MatchSource]:
+    """Return the same where the sensors of a rig share one center, so that nothing tells the scale."""
+    sensors = inputs.images.sensors
+    at_one = sensors.rotations, np.zeros_like(sensors.translations)
+    images = source.images.with_sensors(*at_one)
+    return replace(inputs, images=inputs.images.with_sensors(*at_one)), source.at(images)
+
+
+def find_remedies(found: LocateResult, inputs: RunInputs, source: MatchSource) -> Iterator[Remedy]:
+    """Yield what to start from instead, where something can be done about what speaks against a result."""
+    images, intrinsics, options = source.images, inputs.intrinsics, inputs.options
+    may_free = options.freedom.intrinsics != "held" and options.freedom.adjusts_cameras(images.num_images)
+    freed = {
+        wrong.lens: wrong
+        for wrong in found.evidence.lenses
+        if may_free and images.lenses[wrong.lens].is_adjustable and not intrinsics.parts[wrong.lens, FOCAL]
+    }
+    if freed and ask_resolution(source) is not None:
+        freed = {}  # pixels of another resolution ask for another focal length, and are no fault of the lens
+    # A camera that is fixed, or held by its rig, cannot go where its pairs are.
+    may_move = not (images.has_rigs or inputs.fixed.any())
+    places = found.evidence.places if may_move else ()
+    moved = [place for place in places if place.num_there >= OUTNUMBERED * place.num_here]
+    if not (freed or moved):
+        return
+    lenses, parts = list(images.lenses), intrinsics.parts.copy()
+    for row, wrong in freed.items():
+        known = lenses[row]
+        if known.origin in (None, Origin.CALIBRATION):  # what is contradicted pulls no harder than a guess
+            known = replace(known.in_doubt(Origin.GUESS), origin=Origin.CALIBRATION)
+        lenses[row] = known.longer(wrong.factor)
+        parts[row, FOCAL] = True
+    pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(place.pairs_here for place in moved)])
+    names = ((images.names[i], images.names[j]) for i, j in pairs.tolist())
+    left_out = source.inputs.left_out | {(min(pair), max(pair)) for pair in names}
+    read = replace(source.inputs, left_out=left_out)
+    view = source.matches.at(images.with_lenses(lenses), left_out, source.economy.reading)
+    yield Remedy(
+        replace(inputs, intrinsics=replace(intrinsics, parts=parts)),
+        replace(source, inputs=read, view=view),
+        {row: wrong.sigma for row, wrong in freed.items()},
+        tuple(images.names[place.camera] for place in moved),
+    )
+
+
+def _count(found: LocateResult) -> int:
+    """Return the number of lenses and cameras that evidence names, and of cameras that are left out."""
+    evidence, left_out = found.evidence, int(np.sum(~found.kept))
+    apart = sum(len(seam.cameras) for seam in evidence.seams)
+    apart += sum(len(group.cameras) for group in evidence.untied)
+    return len(evidence.lenses) + left_out + len(evidence.places) + apart
