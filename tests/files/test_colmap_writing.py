@@ -21,7 +21,7 @@ from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.tracks.options import StructureOptions
-from tests.models import centers_of
+from tests.models import arrays, centers_of
 from tests.problems import all_pairs
 from tests.structures import (
     bundle_adjusted,
@@ -390,7 +390,7 @@ def test_colors_are_those_of_the_points_that_are_seen_whatever_their_ids(step):
     model = copy_without_points(original)
     for point_id, point in original.points3D.items():
         model.add_point3D_with_id(7 + step * point_id, pycolmap.Point3D(point.todict()))
-    found = read_colors(model, {})
+    found = read_colors(arrays(model))
     for image_id, seen in found.images.items():
         points2d = original.image(image_id).points2D
         expected = [original.point3D(points2d[k].point3D_id).color for k in seen.keypoints.tolist()]
@@ -554,10 +554,10 @@ def seed_with_points():
     model = read_model(original)
     images, points = (
         model.images.placed(range(1, NUM_IMAGES), ring_centers()[1:]),
-        points_of(original, model.images),
+        points_of(model.arrays, model.images),
     )
     points = points.taken((points.images > 0) & ((points.images + points.keypoints) % 4 > 0))
-    known = points2d_of(original, images)
+    known = points2d_of(model.arrays, images)
     return SeededModel.of(
         template_of(model), images, points, lambda k: known(k).astype("f4") if k in (2, 5) else None
     )
