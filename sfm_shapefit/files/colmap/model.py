@@ -27,7 +27,12 @@ from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.lenses import focal_lengths
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays, RigRecord
 from sfm_shapefit.files.colmap.read_binary import read_folder
-from sfm_shapefit.files.colmap.reconstructions import PYCOLMAP_ERRORS, arrays_of, reconstruction_of
+from sfm_shapefit.files.colmap.reconstructions import (
+    PYCOLMAP_ERRORS,
+    arrays_of,
+    reconstruction_of,
+    unplaced_error,
+)
 from sfm_shapefit.files.norms import are_off, say_normalized
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import names_among
@@ -77,6 +82,8 @@ class ColmapModel:
 
     notes: tuple[str, ...] = ()
     """What is read otherwise than it stands in the input, a sentence each."""
+    given: pycolmap.Reconstruction | None = None
+    """The reconstruction that was handed in, which nobody modifies, if it is this very model."""
 
     @property
     def image_names(self) -> tuple[str, ...]:
@@ -90,8 +97,8 @@ class ColmapModel:
 
     @cached_property
     def reconstruction(self) -> pycolmap.Reconstruction:
-        """The model as a new reconstruction."""
-        return reconstruction_of(self.arrays)
+        """The model as pycolmap has it."""
+        return self.given or reconstruction_of(self.arrays)
 
 
 def renamed_as(model: ColmapModel, names: Sequence[str]) -> ColmapModel:
@@ -118,11 +125,11 @@ def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> Colma
             in its rig is not known, or if fewer than two images have a pose.
     """
     source = model_of(source)
-    label, notes = "the reconstruction", tuple[str, ...]()
+    label, notes, given = "the reconstruction", tuple[str, ...](), None
     if isinstance(source, ModelArrays):
         arrays = source
     elif isinstance(source, pycolmap.Reconstruction):
-        arrays, notes = arrays_of(source)
+        given, (arrays, notes) = source, arrays_of(source)
     elif isinstance(source, Path | str):
         label, (arrays, notes) = str(Path(source)), read_folder(Path(source))
     else:
@@ -130,8 +137,9 @@ def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> Colma
             f"a {type(source).__name__} is no model; give a folder, a reconstruction or a result"
         )
     arrays, note = _with_unit_quaternions(arrays)
-    notes = (*notes, note) if note else notes
-    model = _posed_model(label, ColmapModel(arrays=arrays, images=images_of(arrays), notes=notes))
+    notes = (*notes, *filter(None, [note]))
+    images, given = images_of(arrays), None if notes else given
+    model = _posed_model(label, ColmapModel(arrays=arrays, images=images, notes=notes, given=given))
     return model if rotations_suffice else _with_positions(label, model)
 
 
@@ -179,7 +187,7 @@ def _with_positions(label: str, model: ColmapModel) -> ColmapModel:
     note = f"{said}, so that these have no pose here: {first_of(unknown)}; {remedy}"
     rows = np.flatnonzero(np.isin(model.arrays.frames.ids, images.frames.ids[~images.frames.is_posed]))
     arrays, images = model.arrays.without_poses(rows), images.part(np.flatnonzero(known))
-    return replace(model, arrays=arrays, images=images, notes=(*model.notes, note))
+    return replace(model, arrays=arrays, images=images, notes=(*model.notes, note), given=None)
 
 
 def _posed_model(label: str, model: ColmapModel) -> ColmapModel:
@@ -212,9 +220,6 @@ def _refuse_unplaced_sensors(label: str, model: ModelArrays, images: Images) -> 
     is_open = np.isnan(images.sensors.translations[images.lens_of]).any(axis=1)
     if is_open.any():
         k = int(np.argmax(is_open))
-        rig_id = model.frames.rig_ids[model.images.frame_of[model.images.rows(images.ids[k : k + 1])[0]]]
-        raise InputError(
-            f"{label}: camera {images.lenses[images.lens_of[k]].id} has no pose in rig {rig_id} "
-            f"(sensor_from_rig), so that image {images.names[k]} has none; calibrate the rig, or give a "
-            "trivial rig to each camera"
-        )
+        frame = model.images.frame_of[model.images.rows(images.ids[k : k + 1])[0]]
+        camera_id, rig_id = images.lenses[images.lens_of[k]].id, int(model.frames.rig_ids[frame])
+        raise unplaced_error(label, camera_id, rig_id, images.names[k])

@@ -60,6 +60,7 @@ def arrays_of(reconstruction: pycolmap.Reconstruction) -> tuple[ModelArrays, tup
                 f"{called} refers to an image, a frame or a 3D point that it does not have; "
                 "write it again with COLMAP or pycolmap"
             )
+        _refuse_unplaced_sensors(reconstruction)  # which pycolmap cannot write
         with private_folder() as own, quiet_log():
             reconstruction.write_binary(own)
             model, notes = read_files(ModelFiles(own, called, ""))
@@ -67,6 +68,23 @@ def arrays_of(reconstruction: pycolmap.Reconstruction) -> tuple[ModelArrays, tup
         raise InputError(f"{called} is not a sound COLMAP model: {first_line(error)}") from error
     priors = {i for i, camera in reconstruction.cameras.items() if camera.has_prior_focal_length}
     return _with_unposed(replace(model, prior_focals=frozenset(priors)), reconstruction), notes
+
+
+def _refuse_unplaced_sensors(reconstruction: pycolmap.Reconstruction) -> None:
+    sensors = ((rig, one) for rig in reconstruction.rigs.values() for one in rig.non_ref_sensors.items())
+    unplaced = {(rig.rig_id, sensor.id) for rig, (sensor, pose) in sensors if pose is None}
+    for image in reconstruction.images.values() if unplaced else ():
+        rig_id = reconstruction.frame(image.frame_id).rig_id
+        if image.has_pose and (rig_id, image.camera_id) in unplaced:
+            raise unplaced_error("the reconstruction", image.camera_id, rig_id, name_of(image))
+
+
+def unplaced_error(called: str, camera_id: int, rig_id: int, name: str) -> InputError:
+    """Return the error that nothing says where the camera of an image stands in its rig."""
+    return InputError(
+        f"{called}: camera {camera_id} has no pose in rig {rig_id} (sensor_from_rig), so that image {name} "
+        "has none; calibrate the rig, or give a trivial rig to each camera"
+    )
 
 
 def _with_unposed(model: ModelArrays, reconstruction: pycolmap.Reconstruction) -> ModelArrays:
@@ -128,7 +146,7 @@ def reconstruction_of(model: ModelArrays) -> pycolmap.Reconstruction:
     with private_folder() as own, quiet_log():
         write_binary(model, own)
         built = pycolmap.Reconstruction(own)
-    for camera_id in model.prior_focals:
+    for camera_id in model.prior_focals & {lens.id for lens in model.lenses}:
         built.camera(camera_id).has_prior_focal_length = True
     for k in np.flatnonzero(~model.frames.is_posed).tolist():
         frame = pycolmap.Frame(frame_id=int(model.frames.ids[k]), rig_id=int(model.frames.rig_ids[k]))

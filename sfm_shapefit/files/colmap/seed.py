@@ -103,17 +103,19 @@ class SeededModel:
     @cached_property
     def reconstruction(self) -> pycolmap.Reconstruction:
         """A new reconstruction; the input is not touched."""
+        return reconstruction_of(self.arrays())
+
+    def arrays(self) -> ModelArrays:
+        """Return the model with its points."""
         model, keypoints = put_images(self.template.model, self.images), self._keypoints()
         every = [keypoints(row) for row in range(len(model.images.ids))]
-        blocks = list(self._blocks())
-        return reconstruction_of(
-            replace(
-                model,
-                starts=np.append(0, np.cumsum([len(one) for one in every])),
-                points2d=np.concatenate(every),
-                points=np.concatenate([np.zeros(0, POINT3D), *(heads for heads, _ in blocks)]),
-                tracks=np.concatenate([np.zeros((0, 2), np.uint32), *(tracks for _, tracks in blocks)]),
-            )
+        heads, tracks = zip((np.zeros(0, POINT3D), np.zeros((0, 2), np.uint32)), *self._blocks(), strict=True)
+        return replace(
+            model,
+            starts=np.append(0, np.cumsum([len(one) for one in every])),
+            points2d=np.concatenate(every),
+            points=np.concatenate(heads),
+            tracks=np.concatenate(tracks),
         )
 
     def write(self, folder: Path) -> None:
