@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID, refuse_no_features
@@ -20,6 +19,7 @@ from sfm_shapefit.files.colmap.images import images_of, sensors_of
 from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.model_arrays import (
     CAMERA_SENSOR,
+    ORIGIN,
     FrameRecords,
     ImageRecords,
     ModelArrays,
@@ -71,7 +71,7 @@ class UnposedImages:
                 frames=FrameRecords(
                     ids=ids,
                     rig_ids=np.array([frames[i] for i in ids.tolist()], dtype=np.int64),
-                    poses=_origins(len(ids)),
+                    poses=np.tile(ORIGIN, (len(ids), 1)),
                     data=tuple(data[i] for i in ids.tolist()),
                 ),
                 images=ImageRecords(
@@ -80,11 +80,6 @@ class UnposedImages:
                 starts=np.zeros(len(rows) + 1, dtype=np.int64),
             )
         )
-
-
-def _origins(count: int) -> FloatArray:
-    """Return so many poses (n, 7) at the origin, in the axes of the world."""
-    return np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (count, 1))
 
 
 def read_images(file: DatabaseFile) -> UnposedImages:
@@ -127,7 +122,7 @@ def read_images(file: DatabaseFile) -> UnposedImages:
     model = ModelArrays.alone(
         tuple(lens_of(camera) for _, camera in sorted(usable, key=lambda item: item[0])),
         ImageRecords(image_ids, camera_ids, image_ids, tuple(names[i] for i in ids)),
-        _origins(len(ids)),
+        np.tile(ORIGIN, (len(ids), 1)),
         frozenset(i for i, camera in usable if camera.has_prior_focal_length),
     )
     return UnposedImages(

@@ -28,7 +28,6 @@ from sfm_shapefit.files.colmap.lenses import focal_lengths
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays, RigRecord
 from sfm_shapefit.files.colmap.read_binary import read_folder
 from sfm_shapefit.files.colmap.reconstructions import (
-    PYCOLMAP_ERRORS,
     arrays_of,
     reconstruction_of,
     unplaced_error,
@@ -36,16 +35,6 @@ from sfm_shapefit.files.colmap.reconstructions import (
 from sfm_shapefit.files.norms import are_off, say_normalized
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import names_among
-
-__all__ = [
-    "PYCOLMAP_ERRORS",
-    "ColmapModel",
-    "HoldsModel",
-    "ModelSource",
-    "model_of",
-    "read_model",
-    "renamed_as",
-]
 
 # Sums of squares of larger coordinates overflow; these count as not finite.
 _LARGEST_COORDINATE = 1e100

@@ -17,6 +17,8 @@ from sfm_shapefit.files.colmap.binary_records import NO_POINT, POINT2D, POINT3D
 from sfm_shapefit.scene.lens import Lens
 
 CAMERA_SENSOR = 0  # type of a sensor; COLMAP's number for cameras
+ORIGIN = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Pose of what stands at the origin, in the axes of the world."""
 FEWEST_IMAGES = 2  # observations; COLMAP removes a point that loses one of so many
 
 Sensor = tuple[int, int]
@@ -106,12 +108,17 @@ class ModelArrays:
     def alone(
         cls, lenses: tuple[Lens, ...], images: ImageRecords, poses: FloatArray, prior_focals: frozenset[int]
     ) -> Self:
-        """Return the model of images without keypoints, each in a frame of its own, with `poses` (i, 7)."""
+        """Return the model of images without keypoints, at poses (i, 7), each in a frame of its id.
+
+        Each camera is in a rig of its id, as COLMAP has it where nothing is said of rigs.
+        """
+        pairs = zip(images.ids.tolist(), images.camera_ids.tolist(), strict=True)
+        data = tuple(((CAMERA_SENSOR, camera_id, image_id),) for image_id, camera_id in pairs)
         return cls(
             lenses=lenses,
             prior_focals=prior_focals,
             rigs=tuple(trivial_rig(lens.id) for lens in lenses),
-            frames=frames_alone(images.ids, images.camera_ids, poses),
+            frames=FrameRecords(images.ids, images.camera_ids, poses, data),
             images=images._replace(frame_of=np.arange(len(images.ids))),
             starts=np.zeros(len(images.ids) + 1, dtype=np.int64),
             points2d=np.zeros(0, POINT2D),
@@ -209,12 +216,6 @@ class ModelArrays:
 def trivial_rig(camera_id: int) -> RigRecord:
     """Return the rig of a camera alone, which has its id."""
     return RigRecord(camera_id, {(CAMERA_SENSOR, camera_id): None})
-
-
-def frames_alone(image_ids: IntArray, camera_ids: IntArray, poses: FloatArray) -> FrameRecords:
-    """Return a frame for each image, of its id, in a rig of the camera's id, as COLMAP makes them."""
-    pairs = zip(image_ids.tolist(), camera_ids.tolist(), strict=True)
-    return FrameRecords(image_ids, camera_ids, poses, tuple(((CAMERA_SENSOR, c, i),) for i, c in pairs))
 
 
 def rigid(pose: FloatArray) -> pycolmap.Rigid3d:

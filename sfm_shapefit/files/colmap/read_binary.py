@@ -53,8 +53,6 @@ from sfm_shapefit.files.colmap.model_arrays import (
     Records,
     RigRecord,
     Sensor,
-    frames_alone,
-    trivial_rig,
 )
 from sfm_shapefit.files.colmap.text_model import binary_records
 from sfm_shapefit.files.model_folder import REQUIRED_FILES, model_suffix
@@ -129,20 +127,12 @@ def read_folder(folder: Path) -> tuple[ModelArrays, tuple[str, ...]]:
     if suffix == ".bin":
         return read_files(ModelFiles(folder, str(folder), suffix))
     records, notes = binary_records(folder)
-    in_memory = {name: _in_memory(of_file) for name, of_file in records.items()}
+    in_memory = dict[str, bytes]()
+    for name, of_file in records.items():
+        parts = list(of_file)
+        in_memory[name] = COUNT.pack(len(parts)) + b"".join(parts)
     model, more = read_files(ModelFiles(folder, str(folder), suffix, in_memory))
     return model, (*notes, *more)
-
-
-def _in_memory(records: Iterator[bytes]) -> bytes:
-    """Return records as a binary file, with their count in front."""
-    stream = io.BytesIO(COUNT.pack(0))
-    count = stream.seek(0, os.SEEK_END) - COUNT.size
-    for count, record in enumerate(records, start=1):  # noqa: B007
-        stream.write(record)
-    stream.seek(0)
-    stream.write(COUNT.pack(count))
-    return stream.getvalue()
 
 
 def read_files(files: ModelFiles) -> tuple[ModelArrays, tuple[str, ...]]:
@@ -154,29 +144,21 @@ def read_files(files: ModelFiles) -> tuple[ModelArrays, tuple[str, ...]]:
     lenses, notes = _read_cameras(files)
     cameras = [lens.id for lens in lenses]
     images = _read_images(files, set(cameras))
-    rigs: dict[int, RigRecord] = {}
+    heads = ImageRecords(images.ids, images.camera_ids, images.ids, images.names)
+    model = ModelArrays.alone(lenses, heads, images.poses, frozenset())
+    model = replace(model, starts=images.starts, points2d=images.points2d)
     if files.has("rigs"):
         rigs = _read_rigs(files, set(cameras))
         frames, taken = _read_frames(files, rigs)
-    if rigs:
-        _refuse_other_images(files, taken, images)
-        frame_of = np.searchsorted(frames.ids, [taken[i][0] for i in images.ids.tolist()])
-    else:  # two empty files are read like a model without rigs and frames
-        rigs = {rig.id: rig for rig in map(trivial_rig, cameras)}
-        frames, frame_of = (
-            frames_alone(images.ids, images.camera_ids, images.poses),
-            np.arange(len(images.ids)),
-        )
-    model = ModelArrays(
-        lenses=lenses,
-        rigs=tuple(rigs[i] for i in sorted(rigs)),
-        frames=frames,
-        images=ImageRecords(images.ids, images.camera_ids, frame_of, images.names),
-        starts=images.starts,
-        points2d=images.points2d,
-        points=np.zeros(0, POINT3D),
-        tracks=np.zeros((0, 2), np.uint32),
-    )
+        if rigs:  # two empty files are read like a model without rigs and frames
+            _refuse_other_images(files, taken, images)
+            frame_of = np.searchsorted(frames.ids, [taken[i][0] for i in images.ids.tolist()])
+            model = replace(
+                model,
+                rigs=tuple(rigs[i] for i in sorted(rigs)),
+                frames=frames,
+                images=heads._replace(frame_of=frame_of),
+            )
     try:
         return _with_points(files, model), notes
     except ContradictionError as error:

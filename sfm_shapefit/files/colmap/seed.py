@@ -204,7 +204,7 @@ def write_model(
 ) -> None:
     """Write a model in COLMAP's binary format, or as text, into an existing folder.
 
-    What pycolmap has written is read once more, for it does not notice a disk that is full.
+    Text is read once more, for pycolmap, which writes it, does not notice a disk that is full.
 
     Raises:
         InputError: if the files cannot be written, or not completely.
@@ -212,18 +212,14 @@ def write_model(
     if isinstance(model, SeededModel):
         model.write(folder)
         return
-    if isinstance(model, ModelArrays):
-        if not text:
-            write_binary(model, folder)
-            return
-        model = reconstruction_of(model)
+    if isinstance(model, pycolmap.Reconstruction):
+        model, _ = arrays_of(model)
+    if not text:
+        write_binary(model, folder)
+        return
     try:
-        (model.write_text if text else model.write_binary)(folder)
-    except PYCOLMAP_ERRORS as error:
-        raise InputError(f"{folder} cannot be written; check its permissions and the free space") from error
-    try:
+        reconstruction_of(model).write_text(folder)
         read_folder(folder)
-    except InputError as error:
-        raise InputError(
-            f"the model in {folder} could not be written completely; check the free space"
-        ) from error
+    except (InputError, *PYCOLMAP_ERRORS) as error:
+        reason = f"the model in {folder} could not be written completely"
+        raise InputError(f"{reason}; check the free space and permissions") from error
