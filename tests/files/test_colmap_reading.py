@@ -16,7 +16,7 @@ import pytest
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
-from sfm_shapefit.files.colmap import read_binary, sqlite_file
+from sfm_shapefit.files.colmap import model_arrays, sqlite_file
 from sfm_shapefit.files.colmap.database import find_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.lenses import lens_of, rays_of
@@ -217,9 +217,8 @@ def test_a_model_that_is_read_in_small_pieces_is_judged_like_one_that_is_read_at
 
     file, verdicts = folder / "points3D.bin", []
     data = file.read_bytes()
-    for pieces in (read_binary._PIECE_BYTES, 40):  # smaller than a point, too
-        monkeypatch.setattr(read_binary, "_PIECE_BYTES", pieces)
-        monkeypatch.setattr(read_binary, "_KEYPOINTS_AT_ONCE", pieces)
+    for most in (model_arrays.AT_ONCE, 5):
+        monkeypatch.setattr(model_arrays, "AT_ONCE", most)
         rng, found = np.random.default_rng(1), [verdict()]
         for _ in range(40):
             changed = bytearray(data)

@@ -575,7 +575,7 @@ def seed_with_points():
 
 
 def test_a_seed_writes_the_bytes_that_pycolmap_writes_of_it(tmp_path, monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.files.colmap.seed._POINTS_AT_ONCE", 50)
+    monkeypatch.setattr("sfm_shapefit.files.colmap.seed.AT_ONCE", 50)
     seed = seed_with_points()
     folders = [tmp_path / name for name in ("ours", "theirs")]
     for folder in folders:

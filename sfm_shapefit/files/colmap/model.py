@@ -30,7 +30,6 @@ from sfm_shapefit.files.colmap.read_binary import read_folder
 from sfm_shapefit.files.colmap.reconstructions import (
     arrays_of,
     reconstruction_of,
-    unplaced_error,
 )
 from sfm_shapefit.files.norms import are_off, say_normalized
 from sfm_shapefit.scene.images import Images
@@ -211,4 +210,7 @@ def _refuse_unplaced_sensors(label: str, model: ModelArrays, images: Images) -> 
         k = int(np.argmax(is_open))
         frame = model.images.frame_of[model.images.rows(images.ids[k : k + 1])[0]]
         camera_id, rig_id = images.lenses[images.lens_of[k]].id, int(model.frames.rig_ids[frame])
-        raise unplaced_error(label, camera_id, rig_id, images.names[k])
+        raise InputError(
+            f"{label}: camera {camera_id} has no pose in rig {rig_id} (sensor_from_rig), so that image "
+            f"{images.names[k]} has none; calibrate the rig, or give a trivial rig to each camera"
+        )

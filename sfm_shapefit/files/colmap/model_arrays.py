@@ -17,6 +17,8 @@ from sfm_shapefit.files.colmap.binary_records import NO_POINT, POINT2D, POINT3D
 from sfm_shapefit.scene.lens import Lens
 
 CAMERA_SENSOR = 0  # type of a sensor; COLMAP's number for cameras
+AT_ONCE = 2**14
+"""Points or keypoints that are looked at together; all those of 10,000 images take 200 MB."""
 ORIGIN = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Pose of what stands at the origin, in the axes of the world."""
 FEWEST_IMAGES = 2  # observations; COLMAP removes a point that loses one of so many
@@ -154,11 +156,11 @@ class ModelArrays:
             poses[row] = np.nan if in_rig is None else pose_of(rigid(in_rig) * rigid(poses[row]))
         return poses
 
-    def point_blocks(self, most: int = 2**16) -> Iterator[tuple[Records, UInt32Array]]:
-        """Yield points with their tracks, at most so many at once."""
+    def point_blocks(self) -> Iterator[tuple[Records, UInt32Array]]:
+        """Yield points with their tracks, `AT_ONCE` at a time."""
         ends = np.append(0, np.cumsum(self.points["length"].astype(np.int64)))
-        for first in range(0, len(self.points), most):
-            last = min(first + most, len(self.points))
+        for first in range(0, len(self.points), AT_ONCE):
+            last = min(first + AT_ONCE, len(self.points))
             yield self.points[first:last], self.tracks[ends[first] : ends[last]]
 
     def without_points(self, bare: BoolArray | None = None) -> Self:

@@ -12,7 +12,7 @@ import io
 import math
 import os
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -21,10 +21,11 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array, UInt64Array
+from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.paths import refuse_irregular_file
+from sfm_shapefit.files.colmap import model_arrays
 from sfm_shapefit.files.colmap.binary_records import (
     CAMERA,
     COUNT,
@@ -58,9 +59,6 @@ from sfm_shapefit.files.colmap.text_model import binary_records
 from sfm_shapefit.files.model_folder import REQUIRED_FILES, model_suffix
 from sfm_shapefit.files.norms import may_be_rotations
 from sfm_shapefit.scene.lens import Lens
-
-_PIECE_BYTES = 2**22  # bytes of points3D.bin read at once; checking them takes ten times as much memory
-_KEYPOINTS_AT_ONCE = 2**18  # keypoints whose points are looked up at once; all of 10,000 images take 200 MB
 
 
 class ContradictionError(InputError):
@@ -172,10 +170,10 @@ class _BinaryFile:
     def __init__(self, stream: BinaryIO, size: int, called: str) -> None:
         self._stream, self.left, self.called = stream, size, called
 
-    def fault(self, reason: str, kind: type[InputError] = InputError) -> InputError:
+    def fault(self, reason: str) -> InputError:
         """Return the error that names this file, which is read no further."""
         self._stream.close()
-        return kind(f"{self.called}: {reason}")
+        return InputError(f"{self.called}: {reason}")
 
     def truncated(self, what: str) -> InputError:
         """Return the error that the file ends inside `what`."""
@@ -419,59 +417,70 @@ def _with_points(files: ModelFiles, model: ModelArrays) -> ModelArrays:
     """
     if not files.has("points3D"):
         raise ContradictionError(f"{files.called} has no {files.beside('points3D')}")
-    file = files.open("points3D")
-    count = file.take_count(POINT3D.itemsize, "3D points")
-    points = np.empty(count, POINT3D)
-    tracks = np.empty(((file.left - count * POINT3D.itemsize) // 8, 2), dtype=np.uint32)
-    done, end, contradiction = 0, 0, ""
-    for heads, elements in _pieces_of_points(file, count):
+    model = _take_points(files.open("points3D"), model)
+    called = files.called_as("points3D")
+    contradiction = ""
+    for heads, elements in model.point_blocks():
         is_finite = np.isfinite(heads["xyz"]).all(axis=1)
         if not is_finite.all():
-            raise file.fault(f"3D point {heads['id'][~is_finite][0]} has coordinates that are not finite")
+            point = heads["id"][~is_finite][0]
+            raise InputError(f"{called}: 3D point {point} has coordinates that are not finite")
         rows = np.searchsorted(model.images.ids, elements[:, 0])
         is_there = np.append(model.images.ids, -1)[rows] == elements[:, 0]
         is_there &= elements[:, 1] < np.append(np.diff(model.starts), 0)[rows]
         if not is_there.all():
             image_id, keypoint = elements[~is_there][0].tolist()
-            raise file.fault(
-                f"a track refers to point {keypoint} of image {image_id}, which {files.beside('images')} "
-                "does not have",
-                ContradictionError,
-            )
-        places = model.starts[rows] + elements[:, 1]
-        contradiction = contradiction or _observe(files, model, (heads, elements), places)
-        points[done : done + len(heads)], tracks[end : end + len(elements)] = heads, elements
-        done, end = done + len(heads), end + len(elements)
-    points, tracks = _ascending(points, tracks)
-    ids = points["id"].copy()
-    if len(repeated := ids[1:][ids[1:] == ids[:-1]]):
-        raise file.fault(f"3D point {repeated[0]} stands twice")
-    _refuse_unknown_points(files, model, ids)
+            said = f"a track refers to point {keypoint} of image {image_id}"
+            raise ContradictionError(f"{called}: {said}, which {files.beside('images')} does not have")
+        other = _observe(model, heads, model.starts[rows] + elements[:, 1])
+        if other and not contradiction:
+            k, point, owner = other
+            said = f"the track of 3D point {point} has keypoint {elements[k, 1]} of image {elements[k, 0]}"
+            contradiction = f"{called}: {said}, to which {files.beside('images')} gives 3D point {owner}"
+    _refuse_unknown_points(files, model)
     if contradiction:
-        raise file.fault(contradiction, ContradictionError)
+        raise ContradictionError(contradiction)
+    return model
+
+
+def _take_points(file: _BinaryFile, model: ModelArrays) -> ModelArrays:
+    """Return a model with the points and tracks of points3D.bin, whatever they refer to."""
+    count = file.take_count(POINT3D.itemsize, "3D points")
+    data = np.frombuffer(file.read(file.left, "3D points"), dtype=np.uint8)
+    heads = np.empty((count, POINT3D.itemsize), dtype=np.uint8)
+    elements = np.empty((len(data) - heads.size) // 8 * 8, dtype=np.uint8)
+    complete, end = _split_points(data, heads, elements)
+    if complete < count:
+        raise file.truncated(f"3D point {complete + 1} of {count}")
+    file.left = len(data) - end
+    file.finish()
+    points, tracks = _ascending(heads.view(POINT3D).ravel(), elements.view("<u4").reshape(-1, 2))
+    if len(repeated := points["id"][1:][points["id"][1:] == points["id"][:-1]]):
+        raise file.fault(f"3D point {repeated[0]} stands twice")
     return replace(model, points=points, tracks=tracks)
 
 
-def _observe(
-    files: ModelFiles, model: ModelArrays, piece: tuple[Records, UInt32Array], places: IntArray
-) -> str:
-    """Let keypoints of no point observe those whose tracks have them; return what contradicts that.
+def _observe(model: ModelArrays, heads: Records, places: IntArray) -> tuple[int, int, int] | None:
+    """Let keypoints of no point observe those whose tracks have them.
 
-    `places` are the rows of the keypoints in the tracks.
+    Args:
+        model: whose keypoints change in place.
+        heads: some of its points.
+        places: (t,) rows of the keypoints in their tracks.
+
+    Returns:
+        Where a keypoint is another point's: its number in the tracks, their point, and the other one.
     """
-    heads, elements = piece
-    tracked = np.repeat(heads["id"], heads["length"].astype(np.int64))
-    ids = model.points2d["point3d_id"]
+    tracked, ids = np.repeat(heads["id"], heads["length"].astype(np.int64)), model.points2d["point3d_id"]
     owners = ids[places]
     free = owners == NO_POINT
     if free.any():
         ids[places[free]] = tracked[free]
         owners = ids[places]
     if (owners == tracked).all():
-        return ""
+        return None
     k = int(np.argmax(owners != tracked))
-    said = f"the track of 3D point {tracked[k]} has keypoint {elements[k, 1]} of image {elements[k, 0]}"
-    return f"{said}, to which {files.beside('images')} gives 3D point {owners[k]}"
+    return k, int(tracked[k]), int(owners[k])
 
 
 def _ascending(points: Records, tracks: UInt32Array) -> tuple[Records, UInt32Array]:
@@ -486,13 +495,12 @@ def _ascending(points: Records, tracks: UInt32Array) -> tuple[Records, UInt32Arr
     return points[order], tracks[rows]
 
 
-def _refuse_unknown_points(files: ModelFiles, model: ModelArrays, point_ids: UInt64Array) -> None:
-    """Refuse observations of points that are not among those (p,) of the model, ascending."""
-    ids = model.points2d["point3d_id"]
-    for begin in range(0, len(ids), _KEYPOINTS_AT_ONCE):
-        some = ids[begin : begin + _KEYPOINTS_AT_ONCE]
-        place = np.searchsorted(point_ids, some)
-        unknown = (np.append(point_ids, NO_POINT)[place] != some) & (some != NO_POINT)
+def _refuse_unknown_points(files: ModelFiles, model: ModelArrays) -> None:
+    """Refuse observations of points that are not there."""
+    ids, point_ids = model.points2d["point3d_id"], np.append(model.points["id"], NO_POINT)
+    for begin in range(0, len(ids), model_arrays.AT_ONCE):
+        some = ids[begin : begin + model_arrays.AT_ONCE]
+        unknown = point_ids[np.searchsorted(point_ids, some)] != some
         if unknown.any():
             k = int(np.argmax(unknown))
             image_id = model.images.ids[np.searchsorted(model.starts, begin + k, side="right") - 1]
@@ -500,25 +508,6 @@ def _refuse_unknown_points(files: ModelFiles, model: ModelArrays, point_ids: UIn
                 f"{files.called_as('images')}: image {image_id} observes 3D point {some[k]}, which "
                 f"{files.beside('points3D')} does not have"
             )
-
-
-def _pieces_of_points(file: _BinaryFile, count: int) -> Iterator[tuple[Records, UInt32Array]]:
-    """Yield 3D points and the elements (k, 2) of their tracks, a piece of the file at a time."""
-    done, data = 0, b""
-    while done < count:
-        data += file.read(min(file.left, _PIECE_BYTES), "3D points")
-        piece = np.frombuffer(data, dtype=np.uint8)
-        starts = np.empty(min(count - done, len(data) // POINT3D.itemsize) + 1, dtype=np.int64)
-        complete = int(_walk_points(piece, 0, starts))
-        if not file.left and done + complete < count:
-            raise file.truncated(f"3D point {done + complete + 1} of {count}")
-        begins, end, is_head = starts[:complete, None], starts[complete], np.zeros(len(piece), dtype=np.bool_)
-        is_head[begins + np.arange(POINT3D.itemsize)] = True
-        heads = piece[begins + np.arange(POINT3D.itemsize)].view(POINT3D)[:, 0]
-        yield heads, piece[:end][~is_head[:end]].view("<u4").reshape(-1, 2)
-        data, done = data[end:], done + complete
-    file.left += len(data)
-    file.finish()
 
 
 @inner_kernel
@@ -531,18 +520,20 @@ def _read_u64(data: npt.NDArray[np.uint8], offset: int) -> np.uint64:
 
 
 @kernel
-def _walk_points(data: npt.NDArray[np.uint8], offset: int, starts: IntArray) -> int:
-    """Fill in the offset of each point and the end of the last; return how many points are complete."""
-    size = len(data)
-    count = len(starts) - 1
-    for p in range(count):
-        starts[p] = offset
-        if offset + 51 > size:
-            return p
-        track_length = _read_u64(data, offset + 43)
-        offset += 51
-        if track_length > np.uint64((size - offset) // 8):
-            return p
-        offset += 8 * int(track_length)
-    starts[count] = offset
-    return count
+def _split_points(
+    data: npt.NDArray[np.uint8], heads: npt.NDArray[np.uint8], elements: npt.NDArray[np.uint8]
+) -> tuple[int, int]:
+    """Fill in heads (p, 51) and elements of tracks; return how many are complete, and where these end."""
+    offset, done = 0, 0
+    for p in range(len(heads)):
+        begin = offset + heads.shape[1]
+        if begin > len(data):
+            return p, offset
+        length = _read_u64(data, begin - 8)
+        if length > np.uint64((len(elements) - done) // 8):
+            return p, offset
+        end = begin + 8 * int(length)
+        heads[p] = data[offset:begin]
+        elements[done : done + end - begin] = data[begin:end]
+        offset, done = end, done + end - begin
+    return len(heads), offset

@@ -1,8 +1,8 @@
 """pycolmap's reconstructions: taken from users as arrays, and made of arrays where a user asks for one.
 
 Both go through COLMAP's own binary files, in a private folder: pycolmap has no arrays of points and tracks,
-and objects of them one by one take ten times as long. The files lack whether a focal length is a prior, and
-frames without a pose, which stand at the origin on their way.
+and objects of them one by one take ten times as long. The files lack whether a focal length is a prior;
+frames and sensors without a pose stand at the origin on their way.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ from sfm_shapefit.base.atomic_folder import private_folder
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.files.colmap.images import put_images
-from sfm_shapefit.files.colmap.model_arrays import ORIGIN, ModelArrays
+from sfm_shapefit.files.colmap.model_arrays import ORIGIN, ModelArrays, RigRecord
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.files.colmap.read_binary import ModelFiles, read_files
 from sfm_shapefit.files.colmap.write_binary import write_binary
@@ -58,11 +58,14 @@ def arrays_of(reconstruction: pycolmap.Reconstruction) -> tuple[ModelArrays, tup
                 f"{called} refers to an image, a frame or a 3D point that it does not have; "
                 "write it again with COLMAP or pycolmap"
             )
-        _refuse_unplaced_sensors(reconstruction)  # which pycolmap cannot write
         unposed = [i for i, frame in reconstruction.frames.items() if not frame.has_pose()]
+        sensors = ((i, one) for i, rig in reconstruction.rigs.items() for one in rig.non_ref_sensors.items())
+        unplaced = [(rig_id, sensor) for rig_id, (sensor, pose) in sensors if pose is None]
         priors = {i for i, camera in reconstruction.cameras.items() if camera.has_prior_focal_length}
-        if unposed:
+        if unposed or unplaced:
             reconstruction = pycolmap.Reconstruction(reconstruction)
+        for rig_id, sensor in unplaced:
+            reconstruction.rig(rig_id).set_sensor_from_rig(sensor, pycolmap.Rigid3d())
         for frame_id in unposed:
             reconstruction.frame(frame_id).rig_from_world = pycolmap.Rigid3d()
             reconstruction.register_frame(frame_id)
@@ -72,8 +75,12 @@ def arrays_of(reconstruction: pycolmap.Reconstruction) -> tuple[ModelArrays, tup
     except PYCOLMAP_ERRORS as error:
         raise InputError(f"{called} is not a sound COLMAP model: {_first_line(error)}") from error
     poses = np.where(np.isin(model.frames.ids, unposed)[:, None], np.nan, model.frames.poses)
-    frames = model.frames._replace(poses=poses)
-    return replace(model, frames=frames, prior_focals=frozenset(priors)), notes
+    rigs = {rig.id: rig for rig in model.rigs}
+    for rig_id, sensor in unplaced:
+        nowhere = {(int(sensor.type), int(sensor.id)): None}
+        rigs[rig_id] = RigRecord(rig_id, {**rigs[rig_id].sensors, **nowhere})
+    frames, by_id = model.frames._replace(poses=poses), tuple(rigs[i] for i in sorted(rigs))
+    return replace(model, frames=frames, rigs=by_id, prior_focals=frozenset(priors)), notes
 
 
 def _first_line(error: BaseException) -> str:
@@ -82,23 +89,6 @@ def _first_line(error: BaseException) -> str:
     if "Check failed" in text:  # its own assertions, which say nothing to users
         return "its parts contradict one another"
     return text or type(error).__name__
-
-
-def _refuse_unplaced_sensors(reconstruction: pycolmap.Reconstruction) -> None:
-    sensors = ((rig, one) for rig in reconstruction.rigs.values() for one in rig.non_ref_sensors.items())
-    unplaced = {(rig.rig_id, sensor.id) for rig, (sensor, pose) in sensors if pose is None}
-    for image in reconstruction.images.values() if unplaced else ():
-        rig_id = reconstruction.frame(image.frame_id).rig_id
-        if image.has_pose and (rig_id, image.camera_id) in unplaced:
-            raise unplaced_error("the reconstruction", image.camera_id, rig_id, name_of(image))
-
-
-def unplaced_error(called: str, camera_id: int, rig_id: int, name: str) -> InputError:
-    """Return the error that nothing says where the camera of an image stands in its rig."""
-    return InputError(
-        f"{called}: camera {camera_id} has no pose in rig {rig_id} (sensor_from_rig), so that image {name} "
-        "has none; calibrate the rig, or give a trivial rig to each camera"
-    )
 
 
 def reconstruction_of(model: ModelArrays) -> pycolmap.Reconstruction:

@@ -14,7 +14,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.binary_records import NO_POINT, POINT2D, POINT3D
 from sfm_shapefit.files.colmap.images import put_images
-from sfm_shapefit.files.colmap.model_arrays import ModelArrays, Records
+from sfm_shapefit.files.colmap.model_arrays import AT_ONCE, ModelArrays, Records
 from sfm_shapefit.files.colmap.point_colors import color_points
 from sfm_shapefit.files.colmap.points import Keypoints
 from sfm_shapefit.files.colmap.read_binary import read_folder
@@ -23,8 +23,6 @@ from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.files.colmap.write_binary import write_binary
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
-
-_POINTS_AT_ONCE = 2**16  # points whose bytes are put together at once; all of 10,000 images take 70 MB
 
 
 class PickedPoints(NamedTuple):
@@ -149,20 +147,23 @@ class SeededModel:
 
         return of_image
 
+    def heads(self, rows: IntArray) -> Records:
+        """Return some points (r,) as `POINT3D`."""
+        heads, points = np.empty(len(rows), POINT3D), self.points
+        heads["id"], heads["xyz"], heads["rgb"] = points.ids[rows], points.xyz[rows], self.colors[rows]
+        heads["error"] = -1.0 if points.errors_px is None else points.errors_px[rows]
+        heads["length"] = points.lengths()[rows]
+        return heads
+
     def _blocks(self) -> Iterator[tuple[Records, UInt32Array]]:
         """Yield points and their tracks, some at a time."""
-        for first in range(0, self.points.num_points, _POINTS_AT_ONCE):
-            points, last = self.points, first + _POINTS_AT_ONCE
-            offsets = points.offsets[first : last + 1]
-            seen, lengths = slice(int(offsets[0]), int(offsets[-1])), np.diff(offsets)
-            heads = np.empty(len(lengths), POINT3D)
-            heads["id"], heads["xyz"] = points.ids[first:last], points.xyz[first:last]
-            heads["rgb"] = self.colors[first:last]
-            heads["error"] = -1.0 if points.errors_px is None else points.errors_px[first:last]
-            heads["length"] = lengths
+        points = self.points
+        for first in range(0, points.num_points, AT_ONCE):
+            rows = np.arange(first, min(first + AT_ONCE, points.num_points))
+            seen = slice(int(points.offsets[first]), int(points.offsets[rows[-1] + 1]))
             tracks = np.empty((seen.stop - seen.start, 2), dtype=np.uint32)
             tracks[:, 0], tracks[:, 1] = self.images.ids[points.images[seen]], points.keypoints[seen]
-            yield heads, tracks
+            yield self.heads(rows), tracks
 
 
 def _narrowed(xy: FloatArray | None) -> FloatArray | npt.NDArray[np.float32]:
@@ -180,16 +181,7 @@ def pick_points(model: SeededModel | ModelArrays | pycolmap.Reconstruction, most
     num_all = model.num_points3D() if isinstance(model, SeededModel) else len(model.points)
     count = min(num_all, most)
     rows = np.arange(count) * num_all // max(count, 1)
-    if isinstance(model, SeededModel):
-        points, unknown = model.points, np.full(num_all, -1.0)
-        return PickedPoints(
-            xyz=points.xyz[rows],
-            colors=model.colors[rows],
-            lengths=points.lengths()[rows],
-            errors_px=(unknown if points.errors_px is None else points.errors_px)[rows],
-            num_all=num_all,
-        )
-    heads = model.points[rows]
+    heads = model.heads(rows) if isinstance(model, SeededModel) else model.points[rows]
     return PickedPoints(
         xyz=heads["xyz"].copy(),
         colors=heads["rgb"].copy(),
