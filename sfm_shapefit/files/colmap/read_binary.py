@@ -533,7 +533,9 @@ def _split_points(
         if length > np.uint64((len(elements) - done) // 8):
             return p, offset
         end = begin + 8 * int(length)
-        heads[p] = data[offset:begin]
-        elements[done : done + end - begin] = data[begin:end]
+        for k in range(heads.shape[1]):
+            heads[p, k] = data[offset + k]
+        for k in range(end - begin):
+            elements[done + k] = data[begin + k]
         offset, done = end, done + end - begin
     return len(heads), offset
