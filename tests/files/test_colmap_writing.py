@@ -609,3 +609,37 @@ def test_a_full_disk_is_noticed_although_pycolmap_does_not(tmp_path, limit):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_read_is_written_again_byte_by_byte_and_text_has_the_same_arrays(tmp_path, seed):
+    pycolmap.set_random_seed(seed)
+    rng, options = np.random.default_rng(seed), pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig = (int(n) for n in rng.integers(1, 4, 2))
+    options.num_frames_per_rig, options.num_points3D = 3, 15
+    options.num_points2D_without_point3D = int(rng.integers(0, 4))
+    model = pycolmap.synthesize_dataset(options)
+    for point in list(model.points3D.values())[::2]:
+        point.color = rng.integers(0, 256, 3).astype(np.uint8)
+    model.add_point3D(rng.normal(size=3), pycolmap.Track())  # which nobody observes
+    folders = [tmp_path / name for name in ("theirs", "text", "ours", "of text", "of memory")]
+    for folder in folders:
+        folder.mkdir()
+    model.write_binary(folders[0])
+    model.write_text(folders[1])
+    for source, folder in zip((folders[0], folders[1], model), folders[2:], strict=True):
+        write_model(read_model(source).arrays, folder)
+        for file in folders[0].iterdir():
+            assert (folder / file.name).read_bytes() == file.read_bytes(), file.name
+
+
+def test_an_unposed_frame_and_a_prior_survive_the_way_through_arrays():
+    model, _ = ring_model()
+    model.camera(min(model.cameras)).has_prior_focal_length = True
+    model.deregister_frame(min(model.frames))
+    built = read_model(read_model(model).arrays).reconstruction
+    assert dump(built) == dump(model)
+    assert built.num_reg_images() == model.num_reg_images() == NUM_IMAGES - 1
+    assert [c.has_prior_focal_length for _, c in sorted(built.cameras.items())] == [
+        c.has_prior_focal_length for _, c in sorted(model.cameras.items())
+    ]

@@ -19,8 +19,7 @@ from sfm_shapefit.scene.lens import Lens
 CAMERA_SENSOR = 0  # type of a sensor; COLMAP's number for cameras
 AT_ONCE = 2**14
 """Points or keypoints that are looked at together; all those of 10,000 images take 200 MB."""
-ORIGIN = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""Pose of what stands at the origin, in the axes of the world."""
+ORIGIN = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # pose at the origin, in the axes of the world
 FEWEST_IMAGES = 2  # observations; COLMAP removes a point that loses one of so many
 
 Sensor = tuple[int, int]
@@ -59,7 +58,7 @@ class FrameRecords(NamedTuple):
     rig_ids: IntArray
     """(f,)"""
     poses: FloatArray
-    """(f, 7) of the rig from the world; NaN of those without one, of an unknown position its last three."""
+    """(f, 7) rig_from_world; all NaN where there is none, the last three where the position is unknown."""
     data: tuple[tuple[tuple[int, int, int], ...], ...]
     """Type and id of each sensor, and the id of what it took."""
 
@@ -153,7 +152,7 @@ class ModelArrays:
             if sensor == rigs[rig_id].reference or not posed[row]:
                 continue
             in_rig = rigs[rig_id].sensors[sensor]
-            poses[row] = np.nan if in_rig is None else pose_of(rigid(in_rig) * rigid(poses[row]))
+            poses[row] = np.nan if in_rig is None else pose_of(rigid_of(in_rig) * rigid_of(poses[row]))
         return poses
 
     def point_blocks(self) -> Iterator[tuple[Records, UInt32Array]]:
@@ -220,7 +219,7 @@ def trivial_rig(camera_id: int) -> RigRecord:
     return RigRecord(camera_id, {(CAMERA_SENSOR, camera_id): None})
 
 
-def rigid(pose: FloatArray) -> pycolmap.Rigid3d:
+def rigid_of(pose: FloatArray) -> pycolmap.Rigid3d:
     """Return a pose (7,) as pycolmap's."""
     return pycolmap.Rigid3d(pycolmap.Rotation3d(pose[[1, 2, 3, 0]]), pose[4:])
 
