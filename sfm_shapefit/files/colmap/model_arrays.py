@@ -19,7 +19,7 @@ from sfm_shapefit.scene.lens import Lens
 CAMERA_SENSOR = 0  # type of a sensor; COLMAP's number for cameras
 AT_ONCE = 2**14
 """Points or keypoints that are looked at together; all those of 10,000 images take 200 MB."""
-ORIGIN = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # pose at the origin, in the axes of the world
+ORIGIN = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # a pose; that of the world itself
 FEWEST_IMAGES = 2  # observations; COLMAP removes a point that loses one of so many
 
 Sensor = tuple[int, int]

@@ -95,13 +95,16 @@ def reconstruction_of(model: ModelArrays) -> pycolmap.Reconstruction:
     """Return a new reconstruction of a model, with its images that have no pose.
 
     Raises:
-        InputError: if there is no room for its files.
+        InputError: if there is no room for its files, or pycolmap refuses it.
     """
     unposed = ~model.frames.is_posed
     poses = np.where(unposed[:, None], ORIGIN, model.frames.poses)
     with private_folder() as own, quiet_log():
         write_binary(replace(model, frames=model.frames._replace(poses=poses)), own)
-        built = pycolmap.Reconstruction(own)
+        try:
+            built = pycolmap.Reconstruction(own)
+        except PYCOLMAP_ERRORS as error:
+            raise InputError(f"pycolmap refuses the model: {_first_line(error)}") from error
     for frame_id in model.frames.ids[unposed].tolist():
         built.deregister_frame(frame_id)
     for camera_id in model.prior_focals & {lens.id for lens in model.lenses}:
