@@ -7,10 +7,17 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from sfm_shapefit.files.colmap.model_arrays import ModelArrays
+from sfm_shapefit.files.colmap.reconstructions import arrays_of
 from sfm_shapefit.scene.images import Images
 
 Floats = npt.NDArray[np.float64]
 Change = Callable[[str, Floats, Floats], tuple[Floats, Floats]]
+
+
+def arrays(model: pycolmap.Reconstruction) -> ModelArrays:
+    """Return a model as arrays."""
+    return arrays_of(model)[0]
 
 
 def centers_of(model: pycolmap.Reconstruction) -> Floats:

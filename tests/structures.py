@@ -13,19 +13,18 @@ from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_trac
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.files.colmap.images import images_of, put_images
 from sfm_shapefit.files.colmap.point_colors import color_points, read_colors
-from sfm_shapefit.files.colmap.points import (
-    ModelPictures,
-    add_points,
-    points2d_of,
-    points_of,
-)
+from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
+from sfm_shapefit.files.colmap.reconstructions import reconstruction_of
+from sfm_shapefit.files.colmap.seed import SeededModel
+from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.options import StructureOptions
+from tests.models import arrays
 
 
 def posed_images(model):
     """The posed images of a model, in the order of their ids, through lenses that are all in doubt."""
-    every = images_of(model)
+    every = images_of(arrays(model))
     own = every.part(np.flatnonzero(every.is_posed))
     own = own.part(np.argsort(own.ids))
     return own.with_lenses([in_doubt(lens) for lens in own.lenses])
@@ -47,8 +46,8 @@ def copy_without_points(model):
 def colored(model, original):
     """A copy whose points have the colors of another model's."""
     copy, images = pycolmap.Reconstruction(model), posed_images(model)
-    points, pixels = points_of(model, images), points2d_of(model, images)
-    colors = color_points(points, images.ids.tolist(), pixels, read_colors(original, {}))
+    points, pixels = points_of(arrays(model), images), points2d_of(arrays(model), images)
+    colors = color_points(points, images.ids.tolist(), pixels, read_colors(arrays(original)))
     for k in np.flatnonzero(colors.any(axis=1)).tolist():
         copy.point3D(int(points.ids[k])).color = colors[k]
     return copy
@@ -56,7 +55,7 @@ def colored(model, original):
 
 def pictures_of(model, images):
     """The points2D of a model."""
-    return ModelPictures(images, points2d_of(model, images))
+    return ModelPictures(images, points2d_of(arrays(model), images))
 
 
 def links_of(model, tracks) -> Links:
@@ -64,7 +63,7 @@ def links_of(model, tracks) -> Links:
     if not isinstance(tracks, pycolmap.Reconstruction):
         return tracks
     images = posed_images(model)
-    return collect_tracks(images, pictures_of(model, images), points_of(tracks, images))
+    return collect_tracks(images, pictures_of(model, images), points_of(arrays(tracks), images))
 
 
 def matches_between(model, image_ids, batches):
@@ -77,15 +76,26 @@ def matches_between(model, image_ids, batches):
 
 def filtered(model, options=None):
     """A copy without the points that violate the options."""
-    return colored(with_points(model, points_of(model, posed_images(model)), options), model)
+    return colored(with_points(model, points_of(arrays(model), posed_images(model)), options), model)
 
 
 def with_points(model, points, options=None):
     """A copy with these points instead of its own, filtered."""
-    images, copy = posed_images(model), copy_without_points(model)
+    images = posed_images(model)
     kept = filter_points(points, images, pictures_of(model, images), options or StructureOptions())
-    add_points(copy, images.ids, kept, np.zeros((kept.num_points, 3), dtype=np.uint8))
-    return copy
+    return put_points(model, images, kept)
+
+
+def put_points(model, images, points):
+    """A copy with these points instead of its own."""
+    seed = SeededModel(
+        template=Template(model=arrays(copy_without_points(model))),
+        images=images,
+        points=points,
+        colors=np.zeros((points.num_points, 3), dtype=np.uint8),
+        keypoints=(np.zeros((0, 2)),) * images.num_images,
+    )
+    return seed.reconstruction
 
 
 def triangulated(seed, tracks, options=None, advance=lambda _done, _total: None):
@@ -103,9 +113,8 @@ class AdjustedModel(NamedTuple):
 
 def placed(seed, estimate):
     """A copy of a seed where an estimate has it."""
-    copy = copy_without_points(seed)
-    put_images(copy, estimate.images)
-    return AdjustedModel(copy, estimate)
+    moved = put_images(arrays(copy_without_points(seed)), estimate.images)
+    return AdjustedModel(reconstruction_of(moved), estimate)
 
 
 def bundle_adjusted(seed, tracks, options=None, freedom=None):

@@ -13,8 +13,8 @@ import pytest
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap import sqlite_file
-from sfm_shapefit.files.colmap.check import check_model_files
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.read_binary import read_folder
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.graph_text import read_graph
 from tests.program import run
@@ -132,7 +132,7 @@ def test_a_pipe_or_a_device_in_the_place_of_a_file_is_refused_at_once(tmp_path, 
     with pytest.raises(InputError, match=r"graph\.txt cannot be read: it is a pipe or a device"):
         read_graph(graph)
     with pytest.raises(InputError, match=r"points3D\.bin cannot be read: it is a pipe or a device"):
-        check_model_files(model)
+        read_folder(model)
     with (
         pytest.raises(InputError, match="it is a pipe or a device"),
         view_of(scene / "database.db", sound.images),

@@ -43,7 +43,7 @@ from sfm_shapefit.base.errors import ShapeFitError
 from sfm_shapefit.base.geometry import Similarity, fit_similarity, invert, normalized
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.seed import transform_model
+from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.placement.join import PieceJoin, join_pieces
 

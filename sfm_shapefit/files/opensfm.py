@@ -55,15 +55,6 @@ class OpenSfmModel(NamedTuple):
     keypoints: list[FloatArray]
     """Pixels (k, 2) of the observations of each image."""
 
-    @classmethod
-    def without_points(cls, images: Images) -> "OpenSfmModel":
-        """Return images alone."""
-        none = np.zeros(0, dtype=np.int64)
-        points = Points(
-            xyz=np.zeros((0, 3)), offsets=np.zeros(1, np.int64), images=none, keypoints=none, ids=none
-        )
-        return cls(images, points, np.zeros((0, 3), np.uint8), [np.zeros((0, 2))] * images.num_images)
-
 
 def read_opensfm(file: Path) -> OpenSfmModel:
     """Read the largest reconstruction of a file.

@@ -16,7 +16,9 @@ from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.files.colmap.images import images_of
-from sfm_shapefit.files.colmap.points import ModelPictures, move_model, points2d_of, points_of
+from sfm_shapefit.files.colmap.model_arrays import ModelArrays
+from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
+from sfm_shapefit.files.colmap.reconstructions import arrays_of, moved_reconstruction
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import ObservedTracks
@@ -81,7 +83,8 @@ def bundle_adjust(
     """
     options = merge_options(options, AdjustmentOptions, overrides)
     model = reconstruction.reconstruction if hasattr(reconstruction, "reconstruction") else reconstruction
-    images, points, tracks = read_bundle(model)
+    read, _ = arrays_of(model)
+    images, points, tracks = read_bundle(read)
     has_ray = np.isfinite(tracks.on_plane).all(axis=1)
     seen = np.where(has_ray, points.points_seen(), -1)
     found = TriangulatedPoints(points=points.xyz, tracks=np.arange(points.num_points), points_seen=seen)
@@ -95,21 +98,21 @@ def bundle_adjust(
     solved = adjusted.problem
     moved = views.images_of(images, solved), replace(points, xyz=solved.points)
     return AdjustedModel(
-        reconstruction=move_model(model, *moved),
+        reconstruction=moved_reconstruction(read, *moved),
         frame_ids=tuple(images.frames.ids.tolist()),
         adjusted=adjusted,
         covariances=estimate_covariances(solved, options) if covariances else None,
     )
 
 
-def read_bundle(reconstruction: "pycolmap.Reconstruction") -> tuple[Images, Points, ObservedTracks]:
+def read_bundle(model: ModelArrays) -> tuple[Images, Points, ObservedTracks]:
     """Return the posed images of a model in the order of their ids, its points, and the tracks of these."""
-    every = images_of(reconstruction)
+    every = images_of(model)
     images = every.part(np.flatnonzero(every.is_posed))
     images = images.part(np.argsort(images.ids))
-    points = points_of(reconstruction, images)
+    points = points_of(model, images)
     return (
         images,
         points,
-        collect_tracks(images, ModelPictures(images, points2d_of(reconstruction, images)), points),
+        collect_tracks(images, ModelPictures(images, points2d_of(model, images)), points),
     )

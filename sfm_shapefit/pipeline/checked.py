@@ -131,8 +131,8 @@ def check_source(
 ) -> CheckResult:
     """Judge a model whose matches are open: measure, judge and grade it; another is a second opinion."""
     with clock("points"):
-        pictures = ModelPictures(model.images, points2d_of(model.reconstruction, model.images))
-        structure = Structure(points_of(model.reconstruction, model.images), model.images, pictures)
+        pictures = ModelPictures(model.images, points2d_of(model.arrays, model.images))
+        structure = Structure(points_of(model.arrays, model.images), model.images, pictures)
         quality = image_quality(*structure[:3])
     fits = None
     with clock("directions"), suppress(UnsolvableError):  # no pair may share matches
@@ -253,7 +253,7 @@ def _reasons(
     matches: MatchSource,
 ) -> Iterator[Reason]:
     """Yield what speaks against a model; a weak camera that stands where another model has it is right."""
-    pointless = not (model.reconstruction.num_points3D() or structure.points.num_points)
+    pointless = not (model.num_points or structure.points.num_points)
     centers = model.images.centers
     if np.ptp(centers, axis=0).max() <= _ROUNDING * np.abs(centers).max():
         clause = "all its cameras stand at the same place; place them with sfm-shapefit locate"
@@ -307,7 +307,7 @@ def _tell(
         "num_images": len(cameras),
         "num_placed": model.images.num_images,
         "num_pairs": len(pairs),
-        "num_points": model.reconstruction.num_points3D(),
+        "num_points": model.num_points,
         "figures": KeyFigures.of_cameras(cameras, error_deg, *measures),
         "sigma_of": "",
         "scale": "input: those of the model",

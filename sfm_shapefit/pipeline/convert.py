@@ -105,7 +105,7 @@ def write_converted(
     # Here, so that the command line knows the formats without loading pycolmap.
     from sfm_shapefit.files.colmap.listed_poses import read_by_itself
     from sfm_shapefit.files.colmap.model import model_of, read_model
-    from sfm_shapefit.files.colmap.seed import transform_model
+    from sfm_shapefit.files.colmap.reconstructions import transform_model
     from sfm_shapefit.pipeline.world import world_of
     from sfm_shapefit.pipeline.write import refuse_file
 
@@ -159,7 +159,7 @@ class _Scene(NamedTuple):
 def _contents(name: str, scene: _Scene) -> dict[str, bytes]:
     """Return the content of each file, by what its name has behind the target's stem: also another suffix."""
     images, world = scene.model.images, scene.world
-    if name == "nerf" and scene.model.reconstruction.num_points3D():
+    if name == "nerf" and scene.model.num_points:
         return _with_points(scene)
     if name == "ply":
         return _points_and_cameras(scene)
@@ -182,8 +182,8 @@ def _points_and_cameras(scene: _Scene) -> dict[str, bytes]:
     from sfm_shapefit.report.mesh import camera_mesh, ply_bytes
     from sfm_shapefit.report.results import draw_model
 
-    reconstruction, world = scene.model.reconstruction, scene.world
-    points = pick_points(reconstruction, reconstruction.num_points3D())
+    world = scene.world
+    points = pick_points(scene.model.arrays, scene.model.num_points)
     vertices, faces, colors = camera_mesh(draw_model(scene.model, scene.trust))
     how: Any = {"comment": world.statement, "fine": not world.is_own}
     return {
@@ -198,7 +198,7 @@ def _with_points(scene: _Scene) -> dict[str, bytes]:
     from sfm_shapefit.files.nerf import nerf_text
     from sfm_shapefit.report.mesh import ply_bytes
 
-    points = pick_points(scene.model.reconstruction, scene.model.reconstruction.num_points3D())
+    points = pick_points(scene.model.arrays, scene.model.num_points)
     text = nerf_text(scene.model.images, f"{scene.stem}{_POINTS}")
     return {"": text.encode(errors="backslashreplace"), _POINTS: ply_bytes(points.xyz, points.colors)}
 
@@ -224,7 +224,7 @@ def _write_folder(
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path} is a folder with files, which is never replaced; choose another name")
     with atomic_folder(path, protect=protect) as folder:
-        write_model(model.reconstruction, folder, text=name == "colmap-txt")
+        write_model(model.arrays, folder, text=name == "colmap-txt")
         if world.offset_line:
             (folder / "offset.xyz").write_bytes(world.offset_line)
 

@@ -237,7 +237,7 @@ def draw_images(folder: Path) -> None:
 def adjust_bundle(folder: Path) -> None:
     """Adjust the tracks of a small model, and say how uncertain a bundle is, as after each placement."""
     model = read_model(_workspace(folder, WorkspaceOptions(database=False)))
-    images, _, tracks = read_bundle(model.reconstruction)
+    images, _, tracks = read_bundle(model.arrays)
     adjust_thinly(images, lambda: tracks, StructureOptions(), Freedom())
     adjusted = adjust(_bundle(), loss_scale_px=1.0, threads=2)
     Lens("SIMPLE_FISHEYE", (500.0, 320.0, 240.0)).rays(np.zeros((1, 2)))

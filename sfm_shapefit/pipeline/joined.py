@@ -26,9 +26,8 @@ from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.rows import correlations_of, covariance_of
 from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.facts.tables import CameraRow
-from sfm_shapefit.files.colmap.images import name_of
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.seed import transform_model
+from sfm_shapefit.files.colmap.reconstructions import name_of, transform_model
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.checked import check_source

@@ -9,7 +9,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import METRIC_SIGMA, normalized
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.points import ModelPictures, observed_points, points2d_of
+from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of
 from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import Matches, PairNames, RayMatches
@@ -103,23 +103,21 @@ class _Seen:
             rotations=np.concatenate([images.rotations for images in own]),
             centers=np.concatenate([images.centers for images in own]),
             is_metric=np.array([piece.is_metric for piece in pieces], dtype=np.bool_),
-            points=tuple(
-                np.reshape([point.xyz for point in piece.model.reconstruction.points3D.values()], (-1, 3))
-                for piece in pieces
-            ),
+            points=tuple(piece.model.arrays.points["xyz"].copy() for piece in pieces),
         )
         self.of_name: dict[str, list[int]] = {}
         for v, name in enumerate(self.names):
             self.of_name.setdefault(name, []).append(v)
         self.pictures = [
-            ModelPictures(i, points2d_of(p.model.reconstruction, i)) for p, i in zip(pieces, own, strict=True)
+            ModelPictures(i, points2d_of(p.model.arrays, i)) for p, i in zip(pieces, own, strict=True)
         ]
         self.observed = [self._observed(v) for v in range(len(self.names))]
 
     def _observed(self, v: int) -> tuple[IntArray, IntArray]:
         """Return which keypoints of a camera's image observe a point, and the ids of these."""
         model = self.pieces[self.cameras.piece_of[v]].model
-        keypoints, points = observed_points(model.reconstruction.image(int(model.images.ids[self.row[v]])))
+        row = int(model.arrays.images.rows(model.images.ids[self.row[v : v + 1]])[0])
+        keypoints, points = model.arrays.observed(row)
         return keypoints, points.astype(np.int64)
 
     def points(self, cameras: IntArray, ids: IntArray) -> FloatArray:
@@ -128,8 +126,12 @@ class _Seen:
         is_camera = ids < -1
         found[is_camera] = self.cameras.centers[_camera_id(ids[is_camera])]
         numbers = self.cameras.piece_of[cameras]
-        for m in np.flatnonzero(ids >= 0).tolist():
-            found[m] = self.pieces[numbers[m]].model.reconstruction.point3D(int(ids[m])).xyz
+        for number in np.unique(numbers[ids >= 0]).tolist():
+            own, points = (
+                np.flatnonzero((ids >= 0) & (numbers == number)),
+                self.pieces[number].model.arrays.points,
+            )
+            found[own] = points["xyz"][np.searchsorted(points["id"], ids[own].astype(np.uint64))]
         return found
 
     def shared(self) -> Iterator[_Tie]:

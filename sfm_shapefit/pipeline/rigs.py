@@ -230,8 +230,8 @@ def read_fixed_images(model: ColmapModel, fix: str) -> BoolArray:
 
 def _solved_images(model: ColmapModel) -> BoolArray:
     """Return which images (n,) observe a 3D point."""
-    images = [model.reconstruction.image(i) for i in model.images.ids.tolist()]
-    solved = np.array([image.num_points3D > 0 for image in images], dtype=np.bool_)
+    rows = model.arrays.images.rows(model.images.ids).tolist()
+    solved = np.array([len(model.arrays.observed(row)[0]) > 0 for row in rows], dtype=np.bool_)
     if not solved.any():
         raise InputError("no image of the model observes a 3D point, so none is solved; name those to fix")
     return solved

@@ -61,7 +61,7 @@ def draw_model(model: ColmapModel, trust: Mapping[str, float]) -> Drawing:
         for name, center in zip(images.names, images.centers.tolist(), strict=True)
     ]
     return build_drawing(
-        rows, [], poses=poses_of(images, images.names), points=pick_points(model.reconstruction, MAX_POINTS)
+        rows, [], poses=poses_of(images, images.names), points=pick_points(model.arrays, MAX_POINTS)
     )
 
 
@@ -69,7 +69,7 @@ def _draw_as_it_stands(model: ColmapModel, cameras: Sequence[CameraRow], pairs: 
     """Return the drawing of a model that is the input itself, so that there is nothing to compare it with."""
     poses = poses_of(model.images, [row.name for row in cameras])
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
-    points = pick_points(model.reconstruction, MAX_POINTS)
+    points = pick_points(model.arrays, MAX_POINTS)
     return build_drawing(cameras, pairs, poses=poses, points=points)
 
 

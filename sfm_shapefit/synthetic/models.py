@@ -13,9 +13,10 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.files.colmap.points import add_points
-from sfm_shapefit.files.colmap.seed import write_model
-from sfm_shapefit.files.colmap.template import Template, heads_of
+from sfm_shapefit.files.colmap.images import images_of
+from sfm_shapefit.files.colmap.reconstructions import arrays_of
+from sfm_shapefit.files.colmap.seed import SeededModel, write_model
+from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.scene.points import Points, number_points
 from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras
 from sfm_shapefit.synthetic.mounts import Rigs
@@ -104,14 +105,30 @@ class ModelParts(NamedTuple):
         """Return the model; a frame has the pose of the reference sensor of its rig."""
         cameras, rigs = new_rigs(self.scene.rigs, self.camera)
         images, frames = new_images(self.scene.rigs, self.keypoints)
+        bare = pycolmap.Reconstruction()
+        for camera in cameras:
+            bare.add_camera(camera)
+        for rig in rigs:
+            bare.add_rig(rig)
         for frame, k in zip(frames, np.flatnonzero(self.scene.rigs.sensor_of_image == 0), strict=True):
             frame.rig_from_world = poses[k]
-        model = Template(
-            cameras=tuple(cameras), rigs=tuple(rigs), frames=heads_of(frames), images=tuple(images)
-        ).build()
-        add_points(model, np.arange(1, len(images) + 1), self.points, self.colors)
-        model.update_point_3d_errors()
-        return model
+            bare.add_frame(frame)
+        for image, frame_number in zip(images, self.scene.rigs.frame_of_image.tolist(), strict=True):
+            image.frame_id = frame_number + 1
+            bare.add_image(image)
+        for frame in frames:
+            bare.register_frame(frame.frame_id)
+        model, _ = arrays_of(bare)
+        own = images_of(model)
+        seed = SeededModel(
+            template=Template(model=model),
+            images=own.part(np.argsort(own.ids)),
+            points=self.points,
+            colors=self.colors,
+            keypoints=tuple(self.keypoints),
+        )
+        seed.reconstruction.update_point_3d_errors()
+        return seed.reconstruction
 
 
 def write_models(parts: ModelParts, workspace: Path, content: ModelContent) -> None:

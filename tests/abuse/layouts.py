@@ -1,7 +1,7 @@
 """Where the fields of COLMAP's binary files are: what a mutation can aim at.
 
 A plain walk over a sound file, apart from the walkers of the package, which are what is under attack.
-Layouts: see `sfm_shapefit/files/colmap/check.py`.
+Layouts: see `sfm_shapefit/files/colmap/read_binary.py`.
 """
 
 import struct

@@ -21,7 +21,7 @@ from sfm_shapefit.scene import lens
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
-from tests.models import centers_of
+from tests.models import arrays, centers_of
 from tests.scenes import BUNDLED
 from tests.structures import (
     adjusted_placement,
@@ -101,7 +101,7 @@ WITH_RIGS = [*((model, False) for model in DISTORTIONS), ("OPENCV", True), ("OPE
 def test_the_errors_are_those_of_pycolmap_through_every_lens(model, rigs):
     given = scene(model, rigs=rigs)
     images, tracks = posed_images(given), links_of(given, given)
-    points = points_of(given, images)
+    points = points_of(arrays(given), images)
     assert points.ids.tolist() == sorted(given.point3D_ids())
     held = np.zeros(len(images.lenses), dtype=bool)
     found = TriangulatedPoints(

@@ -13,7 +13,7 @@ import pytest
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.tables import read_trust
-from sfm_shapefit.files.colmap import model as models
+from sfm_shapefit.files.colmap import reconstructions
 from tests.models import posed
 from tests.problems import random_rotations
 from tests.program import run, run_python, run_refused
@@ -145,9 +145,10 @@ def test_assertions_of_colmap_are_put_in_words_of_ours(monkeypatch):
     def fails(*_arguments):
         raise ValueError("[reconstruction.cc:12] Check failed: images_.count(id) (0 vs. 1)")
 
-    monkeypatch.setattr(models, "_posed_model", fails)
+    model = pycolmap.Reconstruction(RING / "sparse/0")
+    monkeypatch.setattr(reconstructions, "read_files", fails)
     with pytest.raises(InputError, match="not a sound COLMAP model: its parts contradict one another"):
-        models.read_model(RING / "sparse/0")
+        reconstructions.arrays_of(model)
 
 
 @pytest.mark.parametrize("command", ["inspect", "place"])

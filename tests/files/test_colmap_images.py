@@ -1,4 +1,4 @@
-"""Reconstructions as `Images` and `Points`, and what changed put back: nothing else changes a bit."""
+"""Models as `Images` and `Points`, and what changed put back: nothing else changes a bit."""
 
 import numpy as np
 import pycolmap
@@ -6,10 +6,12 @@ import pytest
 
 from sfm_shapefit.files.colmap.images import images_of, put_images
 from sfm_shapefit.files.colmap.lenses import lens_of
-from sfm_shapefit.files.colmap.points import add_points, move_model, points_of
+from sfm_shapefit.files.colmap.points import points_of
+from sfm_shapefit.files.colmap.reconstructions import moved_reconstruction, reconstruction_of
 from tests.adjustment.test_views import DISTORTIONS, scene
 from tests.files.test_colmap_writing import dump
-from tests.structures import colored, copy_without_points, pictures_of
+from tests.models import arrays
+from tests.structures import colored, pictures_of, put_points
 
 
 def with_rigs():
@@ -30,7 +32,7 @@ def dump_all(model):
 
 def test_images_stand_and_look_as_pycolmap_says():
     model = with_rigs()
-    images = images_of(model)
+    images = images_of(arrays(model))
     assert list(images.names) == sorted(image.name for image in model.images.values())
     own = images.part(np.flatnonzero(images.is_posed))
     theirs = [model.image(i) for i in own.ids.tolist()]
@@ -67,13 +69,14 @@ def test_the_mean_focal_length_of_every_lens_is_known(name):
 def test_images_put_back_as_they_are_change_no_bit():
     model = with_rigs()
     before = dump_all(model)
-    put_images(model, images_of(model))
-    assert dump_all(model) == before
+    read = arrays(model)
+    assert dump_all(reconstruction_of(put_images(read, images_of(read)))) == before
 
 
 def test_only_what_changed_is_put_back():
     model = with_rigs()
-    before, images = pycolmap.Reconstruction(model), images_of(model)
+    before, read = pycolmap.Reconstruction(model), arrays(model)
+    images = images_of(read)
     rotations, centers = images.frames.rotations.copy(), images.frames.centers.copy()
     moved, turned, gone = np.flatnonzero(images.frames.is_posed)[:3]
     centers[moved] += 1.0
@@ -83,7 +86,8 @@ def test_only_what_changed_is_put_back():
     shifts = images.sensors.translations.copy()
     shifts[sensor] += 0.1
     there = images.posed(rotations, centers).with_sensors(images.sensors.rotations, shifts)
-    put_images(model, there)
+    changed = put_images(read, there)
+    model = reconstruction_of(changed)
     ids = images.frames.ids.tolist()
     assert model.frame(ids[gone]).rig_from_world is None
     poses = {i: (before.frame(i).rig_from_world, model.frame(i).rig_from_world) for i in ids}
@@ -93,7 +97,7 @@ def test_only_what_changed_is_put_back():
             assert old is new is None or bytes(np.array(old.params)) == bytes(np.array(new.params))
     old, new = poses[ids[moved]]
     assert bytes(old.rotation.quat) == bytes(new.rotation.quat)
-    again = images_of(model)
+    again = images_of(changed)
     np.testing.assert_allclose(again.frames.rotations[turned], rotations[turned], atol=1e-15)
     np.testing.assert_allclose(again.frames.centers[moved], centers[moved], atol=1e-12)
     np.testing.assert_array_equal(again.sensors.translations, shifts)
@@ -102,34 +106,34 @@ def test_only_what_changed_is_put_back():
 
 
 def test_lenses_are_put_back():
-    model = scene("RADIAL")
+    model = arrays(scene("RADIAL"))
     (lens,) = images_of(model).lenses
     values = lens.values() * 1.01
-    put_images(model, images_of(model).with_lenses([lens.with_values(values)]))
+    model = put_images(model, images_of(model).with_lenses([lens.with_values(values)]))
     np.testing.assert_array_equal(images_of(model).lenses[0].values(), values)
 
 
 def test_points_read_and_added_again_are_the_same():
     model = scene(rigs=True)
-    images = images_of(model)
-    points, bare = points_of(model, images), copy_without_points(model)
+    read = arrays(model)
+    images = images_of(read)
+    points = points_of(read, images)
     assert points.lengths().tolist() == [model.point3D(i).track.length() for i in points.ids.tolist()]
-    add_points(bare, images.ids, points, np.zeros((points.num_points, 3), dtype=np.uint8))
-    bare = colored(move_model(bare, images, points), model)
+    bare = colored(moved_reconstruction(arrays(put_points(model, images, points)), images, points), model)
     errors = [[p.error for _, p in sorted(one.points3D.items())] for one in (bare, model)]
     np.testing.assert_allclose(*errors, rtol=1e-12)  # sums in the order of tracks
     for one in (bare, model):
         for point in one.points3D.values():
             point.error = 0.0
     assert dump(bare) == dump(model)
-    twice = points_of(bare, images.part(np.arange(3)))
+    twice = points_of(arrays(bare), images.part(np.arange(3)))
     assert twice.offsets[-1] == np.sum(points.images < 3)
 
 
 @pytest.mark.parametrize("name", DISTORTIONS)
 def test_rays_of_pictures_lead_back_to_their_pixels(name):
     model = scene(name)
-    images = images_of(model)
+    images = images_of(arrays(model))
     pictures, camera = pictures_of(model, images), model.camera(1)
     chosen = np.arange(0, pictures.count(2), 3)
     pixels = pictures.pixels(2, chosen)

@@ -16,13 +16,12 @@ import pytest
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
-from sfm_shapefit.files.colmap import check, sqlite_file
-from sfm_shapefit.files.colmap.check import check_model_files
+from sfm_shapefit.files.colmap import model_arrays, sqlite_file
 from sfm_shapefit.files.colmap.database import find_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.lenses import lens_of, rays_of
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
-from sfm_shapefit.files.colmap.points import observed_points
+from sfm_shapefit.files.colmap.read_binary import read_folder
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.pipeline.evaluate import evaluate
 from sfm_shapefit.scene.matches import PLENTY, Reading
@@ -181,13 +180,13 @@ def test_reading_changes_neither_a_folder_nor_a_reconstruction_and_prints_nothin
 @pytest.mark.parametrize("name", MODEL_FILES)
 def test_a_binary_file_cut_at_any_byte_is_refused_at_once(tmp_path, name):
     folder = write_tiny(tmp_path / "m", tiny_model())
-    check_model_files(folder)  # compiles the kernels, so that the clock below sees only the check
+    read_folder(folder)  # compiles the kernels, so that the clock below sees only the check
     data = (folder / name).read_bytes()
     for length in range(len(data)):
         (folder / name).write_bytes(data[:length])
         start = time.process_time()
         with pytest.raises(InputError, match=rf"{name}: the file ends inside .* truncated"):
-            check_model_files(folder)
+            read_folder(folder)
         assert time.process_time() - start < 2.0  # it takes under a millisecond; a hang would not end
 
 
@@ -201,7 +200,8 @@ def test_changed_bytes_end_in_a_sound_answer_or_an_input_error(folder, name):
         changed[int(rng.integers(len(data)))] ^= int(rng.integers(1, 256))
         (folder / name).write_bytes(changed)
         try:
-            check_model_files(folder)
+            _, notes = read_folder(folder)
+            refused += len(notes)  # its points are
         except InputError:
             refused += 1
     assert refused > 5  # most bytes of a model are digits of floats, where a change is a sound model
@@ -210,16 +210,15 @@ def test_changed_bytes_end_in_a_sound_answer_or_an_input_error(folder, name):
 def test_a_model_that_is_read_in_small_pieces_is_judged_like_one_that_is_read_at_once(folder, monkeypatch):
     def verdict():
         try:
-            seen = check_model_files(folder)
+            read, notes = read_folder(folder)
         except InputError:
             return "refused"
-        return [(key, *(column.tolist() for column in columns)) for key, columns in seen.items()]
+        return notes, read.points2d.tobytes(), read.points.tobytes(), read.tracks.tobytes()
 
     file, verdicts = folder / "points3D.bin", []
     data = file.read_bytes()
-    for pieces in (check._PIECE_BYTES, 40):  # smaller than a point, too
-        monkeypatch.setattr(check, "_PIECE_BYTES", pieces)
-        monkeypatch.setattr(check, "_IMAGES_AT_ONCE", min(pieces, 256))
+    for most in (model_arrays.AT_ONCE, 5):
+        monkeypatch.setattr(model_arrays, "AT_ONCE", most)
         rng, found = np.random.default_rng(1), [verdict()]
         for _ in range(40):
             changed = bytearray(data)
@@ -229,7 +228,7 @@ def test_a_model_that_is_read_in_small_pieces_is_judged_like_one_that_is_read_at
         file.write_bytes(data)
         verdicts.append(found)
     assert verdicts[0] == verdicts[1]
-    assert 5 < verdicts[0].count("refused") < 40
+    assert 5 < sum(one == "refused" or len(one[0]) > 0 for one in verdicts[0]) < 40
     assert verdicts[0][0] != "refused"
 
 
@@ -240,7 +239,7 @@ def test_an_absurd_count_and_bytes_after_the_last_record_are_refused(folder, nam
     for damaged, reason in [*counted, (data + b"\0", "1 bytes follow")]:
         (folder / name).write_bytes(damaged)
         with pytest.raises(InputError, match=rf"{name}.*{reason}"):
-            check_model_files(folder)
+            read_folder(folder)
 
 
 def _set(*path_and_value):
@@ -427,11 +426,11 @@ def rigid(qvec, tvec):
 @pytest.mark.parametrize(
     ("part", "name", "value", "message"),
     [
-        ("frame", "rig_from_world", rigid([0.0, 0, 0, 1], [0, INF, 0]), "position of image 2 is not finite"),
-        ("frame", "rig_from_world", rigid([NAN] * 4, [0.0, 0, 0]), "image 2 has no valid rotation"),
-        ("point3D", "xyz", [NAN, 0.0, 0.0], "3D point 2 is not finite"),
+        ("frame", "rig_from_world", rigid([0.0, 0, 0, 1], [0, INF, 0]), "2 has a pose that is not finite"),
+        ("frame", "rig_from_world", rigid([NAN] * 4, [0.0, 0, 0]), "2 has a pose that is not finite"),
+        ("point3D", "xyz", [NAN, 0.0, 0.0], "3D point 2 has coordinates that are not finite"),
         ("point2D", "xy", [NAN, 0.0], "image 2 has a point"),
-        ("camera", "params", [INF, 1.0, 1.0, 0.0], "camera 2 is not finite"),
+        ("camera", "params", [INF, 1.0, 1.0, 0.0], "camera 2 has a parameter that is not finite"),
         ("camera", "params", [0.0, 1.0, 1.0, 0.0], "camera 2 has focal length 0 px"),
     ],
 )
@@ -948,13 +947,11 @@ def test_the_database_is_found_beside_above_or_two_above_the_model(tmp_path, mon
 
 
 def test_images_observe_what_pycolmap_says():
-    model = read_model(COURTYARD / "truth")
-    assert len(model.observed) == model.images.num_images
-    for image_id, told in model.observed.items():
-        for of_file, of_pycolmap in zip(
-            told, observed_points(model.reconstruction.image(image_id)), strict=True
-        ):
-            np.testing.assert_array_equal(of_file, of_pycolmap)
+    model, theirs = read_model(COURTYARD / "truth").arrays, pycolmap.Reconstruction(COURTYARD / "truth")
+    for row, image_id in enumerate(model.images.ids.tolist()):
+        image, (keypoints, points) = theirs.image(image_id), model.observed(row)
+        assert keypoints.tolist() == list(image.get_observation_point2D_idxs())
+        assert points.tolist() == [point.point3D_id for point in image.get_observation_points2D()]
 
 
 def test_rows_are_looked_up_in_the_order_of_their_ids(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.files.colmap.database_images import read_images
+from sfm_shapefit.files.colmap.reconstructions import reconstruction_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from tests.lens_scene import camera_of_model, write_scene
 from tests.program import run
@@ -57,7 +58,7 @@ GOOD = camera_of_model("OPENCV").params.tolist()
 def test_a_guessed_focal_length_that_cannot_be_becomes_colmaps_guess(database, focal, which):
     put(database, 3, params=[focal if k in which else x for k, x in enumerate(GOOD)], prior_focal_length=0)
     read, (note,) = cameras_of(database)
-    camera = read.reconstruction.camera(3)
+    camera = reconstruction_of(read.model).camera(3)
     assert camera.params.tolist() == [768.0, 768.0, *GOOD[2:]]
     assert not camera.has_prior_focal_length
     assert note.startswith("camera 3 of the database: the focal length")
@@ -105,7 +106,7 @@ def test_a_size_that_is_not_there_is_twice_the_principal_point(database, width, 
     )
     put(database, 3, width=width, height=height)
     read, (note,) = cameras_of(database)
-    camera = read.reconstruction.camera(3)
+    camera = reconstruction_of(read.model).camera(3)
     assert (camera.width, camera.height, camera.params.tolist()) == (640, 480, GOOD)
     assert "became 640 x 480" in note
 

@@ -57,5 +57,5 @@ def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(rig_drive, tmp_p
     images = read_from(path, read_images)
     assert images.rigs.incomplete == (1,)
     assert list(images.rigs.rigs) == [2]
-    of_second = {i for i, image in images.reconstruction.images.items() if image.camera_id > 3}
+    of_second = set(images.model.images.ids[images.model.images.camera_ids > 3].tolist())
     assert set(images.rigs.place_of_image) == of_second

@@ -122,7 +122,8 @@ def test_pairs_without_depth_say_nothing_of_focal_lengths(tmp_path):
 def test_pairs_that_are_left_out_say_nothing_of_focal_lengths(tmp_path):
     path = database_with(tmp_path, "PINHOLE", [1150.0, 1150.0, 600.0, 450.0], 0)
     right = read_from(path, calibrate_view_graph, [1])
-    ids = {k: image.name for k, image in read_from(path, read_images).reconstruction.images.items()}
+    every = read_from(path, read_images).images
+    ids = dict(zip(every.ids.tolist(), every.names, strict=True))
     query = "SELECT pair_id, F FROM two_view_geometries ORDER BY pair_id LIMIT 8"
     pairs = read_from(path, DatabaseFile.rows, "two_view_geometries", {("pair_id", "F"): query})
     # As a lens of twice the focal length would have it, about the same principal point.

@@ -9,6 +9,7 @@ import pytest
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself, read_list
+from sfm_shapefit.files.colmap.reconstructions import reconstruction_of
 from sfm_shapefit.files.listed_names import find_images
 from sfm_shapefit.files.nerf import read_nerf
 from sfm_shapefit.files.tum import read_tum
@@ -55,7 +56,7 @@ def test_focal_lengths_are_those_of_the_frame_or_of_all_or_unknown(tmp_path, fra
 @pytest.mark.parametrize("kind", ["transforms.json", "poses.tum"])
 def test_a_models_poses_come_back_by_the_names_of_its_images(tmp_path, kind):
     convert(TRUTH, tmp_path / kind)
-    found = read_list(tmp_path / kind, DATABASE)[0]
+    found = reconstruction_of(read_list(tmp_path / kind, DATABASE)[0])
     truth = poses_of(pycolmap.Reconstruction(TRUTH))
     assert poses_of(found).keys() == truth.keys()
     for name, pose in poses_of(found).items():
@@ -74,6 +75,7 @@ def test_guessed_focal_lengths_are_those_of_the_list_at_the_databases_size_and_m
     assert read_list(tmp_path / "poses.json", database)[1] == frozenset()
     edit_database(database, "UPDATE cameras SET prior_focal_length = 0")
     found, guessed, _ = read_list(tmp_path / "poses.json", database)
+    found = reconstruction_of(found)
     (camera,) = found.cameras.values()
     assert guessed == {camera.camera_id}
     assert camera.mean_focal_length() == pytest.approx(1.1 * camera.width)
@@ -154,7 +156,7 @@ def test_a_time_stamp_is_the_image_of_the_same_number_however_both_are_written(t
     listed = [" ".join([stamp, *line[1:]]) for stamp, line in zip(stamps, lines, strict=True)]
     (tmp_path / "list.tum").write_text("\n".join(listed[2:]))
     found, truth = (
-        poses_of(read_list(tmp_path / "list.tum", database)[0]),
+        poses_of(reconstruction_of(read_list(tmp_path / "list.tum", database)[0])),
         poses_of(pycolmap.Reconstruction(RING / "sparse" / "0")),
     )
     assert sorted(found) == sorted(names[2:])
@@ -182,7 +184,7 @@ def test_a_trajectory_comes_back_by_the_numbers_at_the_end_of_names(tmp_path):
     for image_id, name in enumerate(names, start=1):
         model.image(image_id).name = name
     convert(model, tmp_path / "poses.tum")
-    found = poses_of(read_list(tmp_path / "poses.tum", scene / "database.db")[0])
+    found = poses_of(reconstruction_of(read_list(tmp_path / "poses.tum", scene / "database.db")[0]))
     for name, pose in poses_of(model).items():
         np.testing.assert_allclose(found[name], pose, atol=1e-12)
 
@@ -298,7 +300,7 @@ def test_a_calibrated_list_replaces_the_whole_guess_of_a_database_at_its_size(tm
     )
     found, guessed, _ = read_list(tmp_path / "t.json", database)
     half.rescale(camera.width, camera.height)
-    (own,) = found.cameras.values()
+    (own,) = reconstruction_of(found).cameras.values()
     assert guessed == frozenset()
     assert own.model_name == "OPENCV"
     np.testing.assert_allclose(own.params, half.params, rtol=1e-12)
@@ -311,7 +313,7 @@ def test_images_are_those_of_the_list_and_what_the_database_lacks_is_said(tmp_pa
     ]
     (tmp_path / "t.json").write_text(json.dumps({"frames": frames}))
     found, _, notes = read_list(tmp_path / "t.json", DATABASE)
-    assert sorted(image.name for image in found.images.values()) == names
+    assert sorted(found.images.names) == names
     assert notes == ("the database lacks 1 image of t.json: .\\images\\other.jpg",)
 
 

@@ -22,7 +22,7 @@ import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.other_programs import reconstruction_of, relative_poses_of
+from sfm_shapefit.files.colmap.other_programs import model_of_opensfm, relative_poses_of
 from sfm_shapefit.files.glomap_text import is_relative_poses, read_relative_poses
 from sfm_shapefit.files.nerf import nerf_text
 from sfm_shapefit.files.opensfm import read_opensfm
@@ -64,7 +64,7 @@ def opensfm_file(folder, content=OPENSFM, tracks=TRACKS):
 
 
 def read_foreign(file):
-    return read_model(reconstruction_of(read_opensfm(file)))
+    return read_model(model_of_opensfm(read_opensfm(file)))
 
 
 def test_a_hand_made_scene_is_read_with_the_right_axes_and_units(tmp_path):

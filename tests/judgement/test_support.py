@@ -21,6 +21,7 @@ from sfm_shapefit.judgement.support import (
 from sfm_shapefit.pipeline import seed
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.scene.matches import is_among
+from tests.models import arrays
 from tests.scenes import RING
 
 NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
@@ -49,8 +50,9 @@ def judge(images, points, apart=NO_PAIRS):
 
 
 def arrays_of(found):
-    images = images_of(found.reconstruction)
-    return images, points_of(found.reconstruction, images)
+    model = arrays(found.reconstruction)
+    images = images_of(model)
+    return images, points_of(model, images)
 
 
 def test_observations_of_right_cameras_agree(found):

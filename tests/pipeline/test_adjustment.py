@@ -10,7 +10,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.reasons import Grade
-from tests.models import posed
+from tests.models import arrays, posed
 from tests.scenes import COURTYARD, RING, copied, edit_database
 
 DATABASE, TRUTH = COURTYARD / "database.db", COURTYARD / "truth"
@@ -95,7 +95,7 @@ def test_an_optimum_that_was_asked_for_is_delivered_as_it_is():
 def test_frames_turn_about_their_centers_and_the_input_stays_as_it_is():
     model = read_model(RING / "sparse" / "0")
     other = turned(model.reconstruction, 1.0)
-    found = model.images.turned(images_of(other))
+    found = model.images.turned(images_of(arrays(other)))
     theirs = [other.image(i).cam_from_world().rotation.matrix() for i in model.images.ids.tolist()]
     np.testing.assert_allclose(found.rotations, theirs, atol=1e-14)
     np.testing.assert_allclose(found.centers, model.images.centers, atol=1e-13)

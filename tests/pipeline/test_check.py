@@ -30,7 +30,7 @@ def test_quality_is_that_of_the_models_own_observations():
     model = read_model(RING / "sparse" / "0")
     reconstruction, images = model.reconstruction, model.images
     pictures = pictures_of(reconstruction, images)
-    quality = image_quality(points_of(reconstruction, images), images, pictures)
+    quality = image_quality(points_of(model.arrays, images), images, pictures)
     mean = np.sum(quality.num_points * quality.errors_px) / quality.num_points.sum()
     assert mean == pytest.approx(reconstruction.compute_mean_reprojection_error(), rel=0.05)  # by point there
     image = reconstruction.image(int(model.images.ids[3]))

@@ -11,8 +11,8 @@ import sfm_shapefit
 from scripts.make_data import SCENES  # the one place that knows how a bundled scene was made
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
-from sfm_shapefit.files.colmap.check import check_model_files
-from sfm_shapefit.files.colmap.points import points2d_xy
+from sfm_shapefit.files.colmap.read_binary import read_folder
+from sfm_shapefit.files.colmap.reconstructions import points2d_xy
 from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene, write_workspace
@@ -167,7 +167,7 @@ def test_a_further_piece_is_written_with_a_scale_of_its_own(hinged, tmp_path):
     write_result(hinged, tmp_path / "out")
     folder = tmp_path / "out" / "pieces" / "1"
     assert sorted(path.name for path in folder.parent.iterdir()) == ["1"]
-    check_model_files(folder)
+    read_folder(folder)
     piece = pycolmap.Reconstruction(folder)
     assert set(piece.reg_image_ids()) == first  # the hinge stands in both models
     assert set(hinged.reconstruction.reg_image_ids()) == second
@@ -203,7 +203,7 @@ def test_the_files_say_what_the_result_says_and_pycolmaps_adjustment_starts_from
 ):
     courtyard = courtyard_located
     write_result(courtyard, tmp_path / "out")
-    check_model_files(tmp_path / "out")
+    read_folder(tmp_path / "out")
     facts = json.loads((tmp_path / "out" / "locate.json").read_text())
     assert facts["schema_version"] == 1
     assert facts["num_placed"] == facts["num_images"] == 25

@@ -14,8 +14,8 @@ from sfm_shapefit import check, evaluate, join, locate, map_database
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.tables import read_trust
 from sfm_shapefit.files.colmap.gravity import table_gravity
-from sfm_shapefit.files.colmap.images import name_of
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.reconstructions import name_of
 from sfm_shapefit.files.pair_list import read_pair_list
 from tests.program import run
 from tests.scenes import BUNDLED, RING, edit_database, fingerprint

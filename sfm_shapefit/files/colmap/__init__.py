@@ -1,7 +1,8 @@
-"""COLMAP's files: models through pycolmap, databases through sqlite3. The one door to both.
+"""COLMAP's files: models as arrays, databases through sqlite3. The one door to both.
 
-Nothing here writes to a model or a database that the user owns. Import the modules themselves:
-`check` and `model` read models, `database` reads matches, `matches` holds the values they return.
+Nothing here writes to a model or a database that the user owns. Import the modules themselves: `model` and
+`read_binary` read models, `write_binary` writes them, `database` reads matches, and `reconstructions` makes
+arrays of pycolmap's models and these of arrays.
 
 pycolmap's log takes over SIGTERM, to print a page of stack trace; the first import, here, takes it back.
 """

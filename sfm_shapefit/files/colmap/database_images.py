@@ -10,15 +10,23 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pycolmap
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID, refuse_no_features
 from sfm_shapefit.files.colmap.database_rigs import DatabaseRigs, read_rigs
-from sfm_shapefit.files.colmap.images import bytes_of_name, images_of, sensors_of
+from sfm_shapefit.files.colmap.images import images_of, sensors_of
+from sfm_shapefit.files.colmap.lenses import lens_of
+from sfm_shapefit.files.colmap.model_arrays import (
+    CAMERA_SENSOR,
+    ORIGIN,
+    FrameRecords,
+    ImageRecords,
+    ModelArrays,
+    trivial_rig,
+)
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
-from sfm_shapefit.files.colmap.template import FrameHead, Template
+from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.scene.images import Frames, Images
 
 
@@ -28,8 +36,8 @@ class UnposedImages:
 
     images: Images
     """All of them, those of rigs in frames together, all frames at the origin and in its axes."""
-    reconstruction: pycolmap.Reconstruction
-    """All cameras and images; each image in a frame of its own."""
+    model: ModelArrays
+    """All cameras and images; each image in a frame of its own, at the origin."""
     rigs: DatabaseRigs
     """Which of the images were taken together."""
     left_out: Mapping[str, str]
@@ -37,25 +45,40 @@ class UnposedImages:
 
     def template(self, images: Images) -> Template:
         """Return the template of a model of some images, all frames at the origin."""
-        known, places = self.reconstruction, self.rigs.place_of_image
-        own = [known.image(image_id) for image_id in images.ids.tolist()]
-        used = {places[image.image_id].rig_id for image in own if image.image_id in places}
-        in_rigs = {camera_id for rig_id in used for camera_id in self.rigs.camera_ids(rig_id)}
-        alone = sorted({image.camera_id for image in own} - in_rigs)
-        rig_ids = _free_ids(used, alone)
-        rigs = [trivial_rig(known.camera(camera_id)) for camera_id in alone]
-        frames: dict[int, FrameHead] = {}
-        for image in own:
-            place = places.get(image.image_id)
-            frame_id = image.image_id if place is None else place.frame_id
-            rig_id = image.camera_id if place is None else rig_ids[place.rig_id]
-            frame = frames.setdefault(frame_id, FrameHead(frame_id, rig_id, (), pycolmap.Rigid3d()))
-            frames[frame_id] = frame._replace(data_ids=(*frame.data_ids, image.data_id))
+        every, places = self.model.images, self.rigs.place_of_image
+        rows = every.rows(np.sort(images.ids))
+        pairs = list(zip(every.ids[rows].tolist(), every.camera_ids[rows].tolist(), strict=True))
+        used = sorted({places[image_id].rig_id for image_id, _ in pairs if image_id in places})
+        in_rigs = {camera_id for rig_id in used for camera_id in self.rigs.rigs[rig_id].camera_ids}
+        alone = {camera_id for _, camera_id in pairs} - in_rigs
+        rig_ids = _free_ids(set(used), alone)
+        rigs = [*map(trivial_rig, alone), *(self.rigs.rigs[i]._replace(id=rig_ids[i]) for i in used)]
+        frames: dict[int, int] = {}
+        data: dict[int, tuple[tuple[int, int, int], ...]] = {}
+        for image_id, camera_id in pairs:
+            place = places.get(image_id)
+            frame_id = image_id if place is None else place.frame_id
+            frames[frame_id] = camera_id if place is None else rig_ids[place.rig_id]
+            data[frame_id] = (*data.get(frame_id, ()), (CAMERA_SENSOR, camera_id, image_id))
+        ids = np.array(sorted(frames), dtype=np.int64)
+        of_image = [places[i].frame_id if i in places else i for i, _ in pairs]
+        names = tuple(every.names[row] for row in rows.tolist())
         return Template(
-            cameras=tuple(known.camera(camera_id) for camera_id in (*alone, *sorted(in_rigs))),
-            rigs=(*rigs, *(self.rigs.renumbered(rig_id, rig_ids[rig_id]) for rig_id in sorted(used))),
-            frames=tuple(frames.values()),
-            images=tuple(own),
+            model=replace(
+                self.model,
+                lenses=tuple(lens for lens in self.model.lenses if lens.id in alone | in_rigs),
+                rigs=tuple(sorted(rigs, key=lambda rig: rig.id)),
+                frames=FrameRecords(
+                    ids=ids,
+                    rig_ids=np.array([frames[i] for i in ids.tolist()], dtype=np.int64),
+                    poses=np.tile(ORIGIN, (len(ids), 1)),
+                    data=tuple(data[i] for i in ids.tolist()),
+                ),
+                images=ImageRecords(
+                    every.ids[rows], every.camera_ids[rows], np.searchsorted(ids, of_image), names
+                ),
+                starts=np.zeros(len(rows) + 1, dtype=np.int64),
+            )
         )
 
 
@@ -74,31 +97,37 @@ def read_images(file: DatabaseFile) -> UnposedImages:
         raise InputError(
             f"{path} has {len(images)} images, but two or more are needed; extract features first"
         )
-    model, lost = pycolmap.Reconstruction(), dict[int, list[str]]()
-    for camera in cameras.usable.values():
-        model.add_camera_with_trivial_rig(camera)
+    lost, camera_of, names = dict[int, list[str]](), dict[int, int](), dict[int, str]()
     for image_id, name, camera_id in images:
         is_sound = is_between(image_id, 0, MAX_NUM_IMAGES) and isinstance(name, str)
         if is_sound and is_between(camera_id, 0, NO_ID) and camera_id in cameras.impossible:
             lost.setdefault(camera_id, []).append(name)
             continue
-        if not (is_sound and is_between(camera_id, 0, NO_ID) and model.exists_camera(camera_id)):
+        if not (is_sound and is_between(camera_id, 0, NO_ID) and camera_id in cameras.usable):
             refuse_no_features(file)
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid name and camera; it is damaged"
             )
-        if model.exists_image(image_id):
+        if image_id in camera_of:
             raise InputError(f"{path}: the image with id {image_id} stands twice; remove one of them")
-        image = pycolmap.Image(name=bytes_of_name(name), camera_id=camera_id, image_id=image_id)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+        camera_of[image_id], names[image_id] = camera_id, name
     notes = list(cameras.notes(lost))
-    if model.num_images() < 2:
+    if len(camera_of) < 2:
         raise InputError(f"{path}: fewer than two images are left; {'; '.join(notes)}")
     file.notes += [note for note in notes if note not in file.notes]
-    rigs = read_rigs(file, model, cameras.impossible)
+    rigs = read_rigs(file, cameras.usable, camera_of, cameras.impossible)
+    ids = sorted(names)
+    image_ids, camera_ids = (np.array(a, dtype=np.int64) for a in (ids, [camera_of[i] for i in ids]))
+    usable = cameras.usable.items()
+    model = ModelArrays.alone(
+        tuple(lens_of(camera) for _, camera in sorted(usable, key=lambda item: item[0])),
+        ImageRecords(image_ids, camera_ids, image_ids, tuple(names[i] for i in ids)),
+        np.tile(ORIGIN, (len(ids), 1)),
+        frozenset(i for i, camera in usable if camera.has_prior_focal_length),
+    )
     return UnposedImages(
         images=_put_in_rigs(images_of(model), rigs),
-        reconstruction=model,
+        model=model,
         rigs=rigs,
         left_out={
             name: f"its camera {i} {cameras.impossible[i]}" for i, names in lost.items() for name in names
@@ -114,13 +143,6 @@ def _put_in_rigs(alone: Images, rigs: DatabaseRigs) -> Images:
     sensors = sensors_of(rigs.rigs.values(), [lens.id for lens in alone.lenses])
     frames = Frames(ids=ids, rotations=np.tile(np.eye(3), (len(ids), 1, 1)), centers=np.zeros((len(ids), 3)))
     return replace(alone, frame_of=frame_of.ravel(), frames=frames, sensors=sensors)
-
-
-def trivial_rig(camera: pycolmap.Camera) -> pycolmap.Rig:
-    """Return the rig of a camera alone, which has its id."""
-    rig = pycolmap.Rig(rig_id=camera.camera_id)
-    rig.add_ref_sensor(camera.sensor_id)
-    return rig
 
 
 def _free_ids(wanted: set[int], taken: Collection[int]) -> dict[int, int]:

@@ -24,8 +24,8 @@ import pycolmap
 
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
-from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS
 from sfm_shapefit.files.colmap.quiet import quiet_stderr
+from sfm_shapefit.files.colmap.reconstructions import PYCOLMAP_ERRORS
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Origin

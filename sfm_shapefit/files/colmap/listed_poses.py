@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
@@ -21,12 +20,13 @@ from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.intrinsics import find_uncalibrated
 from sfm_shapefit.files.colmap.lenses import camera_of, lens_of
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, read_model
-from sfm_shapefit.files.colmap.other_programs import reconstruction_of
+from sfm_shapefit.files.colmap.model_arrays import ModelArrays
+from sfm_shapefit.files.colmap.other_programs import model_of_images, model_of_opensfm
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.json_node import read_json
 from sfm_shapefit.files.listed_names import find_images
 from sfm_shapefit.files.nerf import read_nerf
-from sfm_shapefit.files.opensfm import OpenSfmModel, read_opensfm
+from sfm_shapefit.files.opensfm import read_opensfm
 from sfm_shapefit.files.tum import read_tum
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
@@ -74,7 +74,7 @@ def read_by_itself(source: ModelSource, *, with_lenses: bool = False) -> ColmapM
         return read_model(source)
     file = Path(source)
     if file.suffix.lower() == ".json" and isinstance(read_json(file), list):
-        return read_model(reconstruction_of(read_opensfm(file)))
+        return read_model(model_of_opensfm(read_opensfm(file)))
     poses = _READERS[file.suffix.lower()](file)
     lenses = [lens or _UNKNOWN for lens in poses.lenses]
     if with_lenses and _UNKNOWN in lenses:
@@ -86,13 +86,11 @@ def read_by_itself(source: ModelSource, *, with_lenses: bool = False) -> ColmapM
     names = [_FOLDER.sub("", name.replace("\\", "/")) for name in poses.names]
     lens_of = [known.index(lens) for lens in lenses]
     images = Images.listed(names, (poses.rotations, poses.centers), lens_of, known)
-    read = read_model(reconstruction_of(OpenSfmModel.without_points(images)))
+    read = read_model(model_of_images(images))
     return replace(read, notes=(*poses.notes, *read.notes))
 
 
-def read_list(
-    file: Path, database: Path | str | None
-) -> tuple[pycolmap.Reconstruction, frozenset[int], tuple[str, ...]]:
+def read_list(file: Path, database: Path | str | None) -> tuple[ModelArrays, frozenset[int], tuple[str, ...]]:
     """Return the images of a database with the poses of a list, ids of cameras as `read_source`, and notes.
 
     Images that the list lacks come only where another of their frame is in it.
@@ -116,14 +114,15 @@ def read_list(
         )
     there = np.isin(read.images.frame_of, read.images.frame_of[rows[rows >= 0]])
     images, place = read.images.part(np.flatnonzero(there)), np.append(np.cumsum(there) - 1, -1)
-    model = read.template(images).build()
-    put_images(model, _pose(images, place[rows], poses))
-    lenses = np.where(rows >= 0, read.images.lens_of[rows], -1)
-    guessed = {
-        read.images.lenses[k].id
-        for k in uncalibrated
-        if _set_lens(model.camera(read.images.lenses[k].id), poses, np.flatnonzero(lenses == k))
-    }
+    model = put_images(read.template(images).model, _pose(images, place[rows], poses))
+    numbers = np.where(rows >= 0, read.images.lens_of[rows], -1)
+    lenses, guessed = {lens.id: lens for lens in model.lenses}, set[int]()
+    for k in uncalibrated:
+        lens = read.images.lenses[k]
+        if lens.id in lenses:
+            lenses[lens.id], is_guess = _lens_by(poses, lens, np.flatnonzero(numbers == k))
+            guessed |= {lens.id} if is_guess else set()
+    model = replace(model, lenses=tuple(lenses.values()))
     lost = [name for name, row in zip(poses.names, rows.tolist(), strict=True) if row < 0]
     said = f"the database lacks {counted(len(lost), 'image')} of {file.name}: {first_of(lost)}"
     return model, frozenset(guessed), (*poses.notes, said) if lost else poses.notes
@@ -151,30 +150,29 @@ def _pose(images: Images, rows: IntArray, poses: ListedPoses) -> Images:
     return images.posed(rotations, centers)
 
 
-def _set_lens(camera: pycolmap.Camera, poses: ListedPoses, rows: IntArray) -> bool:
-    """Give a camera the lens that some poses of a list have, and return whether that is a guess still.
+def _lens_by(poses: ListedPoses, lens: Lens, rows: IntArray) -> tuple[Lens, bool]:
+    """Return the lens that some poses of a list have in place of one, and whether that is a guess still.
 
     A list that has distortion, or a principal point outside of the middle, was calibrated: its lens is taken
     as a whole. Any other tells the focal length alone. Where several differ, the median counts.
     """
-    lenses = [scaled for k in rows.tolist() if (scaled := _scaled(poses.lenses[k], camera)) is not None]
-    same = [lens.parameters for lens in lenses if lens.model == lenses[0].model]
+    lenses = [scaled for k in rows.tolist() if (scaled := _scaled(poses.lenses[k], lens)) is not None]
+    same = [one.parameters for one in lenses if one.model == lenses[0].model]
     if len(lenses) == len(rows) and any(map(_is_calibrated, lenses)):
-        camera.model = pycolmap.CameraModelId.__members__[lenses[0].model]
-        camera.params = np.median(same, axis=0).tolist()
-        return False
-    return _set_focal_length(camera, poses.focal_shares[rows])
+        parameters = tuple(np.median(same, axis=0).tolist())
+        return replace(lens, model=lenses[0].model, parameters=parameters), False
+    return _with_focal_length(lens, poses.focal_shares[rows])
 
 
-def _scaled(lens: Lens | None, camera: pycolmap.Camera) -> Lens | None:
-    """Return a lens at the size of a camera's pictures; None if these are not the same but for their size."""
-    if lens is None or (lens.width, lens.height) == (camera.width, camera.height):
+def _scaled(lens: Lens | None, like: Lens) -> Lens | None:
+    """Return a lens at the size of another one's pictures; None if more than their size differs."""
+    if lens is None or (lens.width, lens.height) == (like.width, like.height):
         return lens
-    scales = camera.width / lens.width, camera.height / lens.height
+    scales = like.width / lens.width, like.height / lens.height
     if abs(scales[0] / scales[1] - 1.0) > _SAME_SHAPE:
         return None
     scaled = camera_of(lens)
-    scaled.rescale(camera.width, camera.height)
+    scaled.rescale(like.width, like.height)
     return lens_of(scaled)
 
 
@@ -187,19 +185,18 @@ def _is_calibrated(lens: Lens) -> bool:
     return bool(camera.params[camera.extra_params_idxs()].any() or off_px.max() > _MIDDLE_PX)
 
 
-def _set_focal_length(camera: pycolmap.Camera, shares: FloatArray) -> bool:
-    """Give a camera the median focal length of its images, if any is known, and return whether one is.
+def _with_focal_length(lens: Lens, shares: FloatArray) -> tuple[Lens, bool]:
+    """Return a lens with the median focal length of its images, if any is known, and whether one is.
 
     `shares` (n, 2) are of width and height.
     """
     across = shares[:, 0][shares[:, 0] > 0.0]
     if not len(across):
-        return False
-    x = float(np.median(across)) * camera.width
+        return lens, False
+    x = float(np.median(across)) * lens.width
     down = shares[:, 1][shares[:, 1] > 0.0]
-    y = float(np.median(down)) * camera.height if len(down) else x
-    params, places = camera.params.tolist(), list(camera.focal_length_idxs())
+    y = float(np.median(down)) * lens.height if len(down) else x
+    parameters, places = list(lens.parameters), list(camera_of(lens).focal_length_idxs())
     for place, length in zip(places, (x, y) if len(places) == 2 else (0.5 * (x + y),), strict=True):
-        params[place] = length
-    camera.params = params
-    return True
+        parameters[place] = length
+    return replace(lens, parameters=tuple(parameters)), True

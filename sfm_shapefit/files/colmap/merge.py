@@ -9,9 +9,7 @@ import pycolmap
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.files.colmap.images import bytes_of_name, name_of
-from sfm_shapefit.files.colmap.points import points2d_xy
-from sfm_shapefit.files.colmap.seed import transform_model
+from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, name_of, points2d_xy, transform_model
 
 _LEAST_TRACK = 2  # observations; a point with fewer is none
 _SAME_PIXEL = 0.5  # pixels; keypoints of two models that are no farther apart are one

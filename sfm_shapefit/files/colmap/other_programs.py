@@ -1,36 +1,50 @@
-"""Models of OpenSfM as reconstructions, and pose graphs as relative poses."""
+"""Images and models of other programs as COLMAP's models, and pose graphs as relative poses."""
 
 import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.images import bytes_of_name
-from sfm_shapefit.files.colmap.lenses import camera_of
-from sfm_shapefit.files.colmap.points import add_points
+from sfm_shapefit.files.colmap.model_arrays import ImageRecords, ModelArrays, pose_of
+from sfm_shapefit.files.colmap.seed import SeededModel
+from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
 from sfm_shapefit.files.opensfm import OpenSfmModel
+from sfm_shapefit.scene.images import Images
 
 
-def reconstruction_of(read: OpenSfmModel) -> pycolmap.Reconstruction:
-    """Return a model of OpenSfM as a new reconstruction: a frame for each image, all focal lengths known."""
-    model, images = pycolmap.Reconstruction(), read.images
-    for lens in images.lenses:
-        camera = camera_of(lens)
-        camera.has_prior_focal_length = True
-        model.add_camera_with_trivial_rig(camera)
-    for k, xy in enumerate(read.keypoints):
-        rotation, camera_id = images.frames.rotations[k], images.lenses[images.lens_of[k]].id
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ images.frames.centers[k])
-        image = pycolmap.Image(
-            name=bytes_of_name(images.names[k]),
-            keypoints=xy,
-            camera_id=camera_id,
-            image_id=int(images.ids[k]),
-        )
-        model.add_image_with_trivial_frame(image, pose)
-    add_points(model, images.ids, read.points, read.colors)
-    model.update_point_3d_errors()
-    return model
+def model_of_images(images: Images) -> ModelArrays:
+    """Return the model of images in frames of their own, without keypoints, all focal lengths known."""
+    order, frames = np.argsort(images.ids), images.frames
+    poses = [
+        pose_of(pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ center))
+        for rotation, center in zip(frames.rotations[order], frames.centers[order], strict=True)
+    ]
+    camera_ids = np.array([lens.id for lens in images.lenses], dtype=np.int64)
+    return ModelArrays.alone(
+        tuple(images.lenses[k] for k in np.argsort(camera_ids).tolist()),
+        ImageRecords(
+            images.ids[order],
+            camera_ids[images.lens_of[order]],
+            order,
+            tuple(images.names[k] for k in order.tolist()),
+        ),
+        np.array(poses),
+        frozenset(camera_ids.tolist()),
+    )
+
+
+def model_of_opensfm(read: OpenSfmModel) -> pycolmap.Reconstruction:
+    """Return a model of OpenSfM as a new reconstruction."""
+    template = Template(model=model_of_images(read.images))
+    seed = SeededModel(
+        template=template,
+        images=read.images,
+        points=read.points,
+        colors=read.colors,
+        keypoints=tuple(read.keypoints),
+    )
+    seed.reconstruction.update_point_3d_errors()
+    return seed.reconstruction
 
 
 def relative_poses_of(graph: pycolmap.PoseGraph) -> EpipolarGeometries:

@@ -20,8 +20,8 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.files.colmap.images import bytes_of_name, name_of
 from sfm_shapefit.files.colmap.quiet import quiet_log
+from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, name_of
 from sfm_shapefit.files.options import MatchingOptions
 
 _READABLE = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})

@@ -19,9 +19,9 @@ import pycolmap
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.paths import file_of
-from sfm_shapefit.files.colmap.images import bytes_of_name
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.quiet import quiet_log
+from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, reconstruction_of
 
 _LONGEST_PX = 1600  # pixels, longer side of a picture as it is read; twice as many take four times as long
 _MOST_FEATURES = 4096  # keypoints of a picture, the largest ones; half of COLMAP's, in half of its time
@@ -70,7 +70,9 @@ class PictureMatches:
 
     def _write_images(self, database: pycolmap.Database) -> None:
         """Write lenses, rigs, images and frames as the model has them, under their ids as names."""
-        model, ids = self.model.reconstruction, self.model.images.ids.tolist()
+        arrays = self.model.arrays
+        model = reconstruction_of(arrays.without_points(np.ones(len(arrays.images.ids), dtype=np.bool_)))
+        ids = self.model.images.ids.tolist()
         with pycolmap.DatabaseTransaction(database):
             for camera in map(copy.copy, model.cameras.values()):
                 camera.has_prior_focal_length = True

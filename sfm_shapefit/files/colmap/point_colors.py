@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, UInt64Array
-from sfm_shapefit.files.colmap.points import Observed, observed_points, points2d_xy
+from sfm_shapefit.files.colmap.model_arrays import ModelArrays
 from sfm_shapefit.scene.points import Points
 
 _SPARSE = 8  # ids for each point; a table by id, of more, takes longer to fill than a search
@@ -37,21 +36,17 @@ class PointColors:
     """By the ids of the images; of a model without any color, none."""
 
 
-def read_colors(source: pycolmap.Reconstruction, observed: Observed) -> PointColors:
-    """Return the colors of a model's points; black is none. `observed` has what some of its images see."""
-    # As a string of bytes: an array of each takes three times as long.
-    colored = sorted((k, point.color.tobytes()) for k, point in source.points3D.items())
-    ids = np.array([k for k, _ in colored], dtype=np.uint64)
-    colors = np.frombuffer(b"".join(color for _, color in colored), dtype=np.uint8).reshape(-1, 3)
+def read_colors(source: ModelArrays) -> PointColors:
+    """Return the colors of a model's points; black is none."""
+    ids, colors = source.points["id"].copy(), source.points["rgb"].copy()
     if not colors.any():
         return PointColors(colors=colors, images={})
     images, row_of = {}, _rows_by_id(ids)
-    for image_id in sorted(source.images.keys()):
-        image = source.image(image_id)
-        keypoints, seen = observed.get(image_id) or observed_points(image)
+    for row, image_id in enumerate(source.images.ids.tolist()):
+        keypoints, seen = source.observed(row)
         if len(keypoints):
             rows = np.searchsorted(ids, seen) if row_of is None else row_of[seen - ids[0]]
-            digest = _digest(points2d_xy(image))
+            digest = _digest(np.ascontiguousarray(source.keypoints(row)["xy"]))
             images[image_id] = SeenColors(digest, keypoints.astype(np.int32), rows.astype(np.int32))
     return PointColors(colors=colors, images=images)
 

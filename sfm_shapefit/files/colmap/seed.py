@@ -1,6 +1,6 @@
 """Seeded models: cameras, rigs and image names of the input, our poses and points."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,20 +10,19 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.files.colmap.binary_records import COUNT, IMAGE, NO_POINT, POINT2D, POINT3D
-from sfm_shapefit.files.colmap.check import check_model_files
+from sfm_shapefit.files.colmap.binary_records import NO_POINT, POINT2D, POINT3D
 from sfm_shapefit.files.colmap.images import put_images
-from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS
+from sfm_shapefit.files.colmap.model_arrays import AT_ONCE, ModelArrays, Records
 from sfm_shapefit.files.colmap.point_colors import color_points
-from sfm_shapefit.files.colmap.points import Keypoints, add_points, points2d_xy
+from sfm_shapefit.files.colmap.points import Keypoints
+from sfm_shapefit.files.colmap.read_binary import read_folder
+from sfm_shapefit.files.colmap.reconstructions import PYCOLMAP_ERRORS, arrays_of, reconstruction_of
 from sfm_shapefit.files.colmap.template import Template
+from sfm_shapefit.files.colmap.write_binary import write_binary
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
-
-_POINTS_AT_ONCE = 2**16  # points whose bytes are put together at once; all of 10,000 images take 70 MB
 
 
 class PickedPoints(NamedTuple):
@@ -70,11 +69,12 @@ class SeededModel:
         """
         keypoints = keypoints or (lambda _: None)
         own = tuple(_narrowed(keypoints(k)) for k in range(images.num_images))
-        there = {image.image_id: image for image in template.images}
-        ids = images.ids.tolist()
+        rows, ids = template.model.images.rows(images.ids).tolist(), images.ids.tolist()
 
         def pixels(image: int) -> FloatArray:
-            return own[image].astype(np.float64) if len(own[image]) else points2d_xy(there[ids[image]])
+            if len(own[image]):
+                return own[image].astype(np.float64)
+            return np.ascontiguousarray(template.model.keypoints(rows[image])["xy"])
 
         colors = color_points(points, ids, pixels, template.colors)
         bare = replace(template, colors=None)
@@ -101,71 +101,69 @@ class SeededModel:
     @cached_property
     def reconstruction(self) -> pycolmap.Reconstruction:
         """A new reconstruction; the input is not touched."""
-        model = self._without_points()
-        for image_id, xy in zip(self.images.ids.tolist(), self.keypoints, strict=True):
-            if len(xy):
-                image = model.image(image_id)
-                image.points2D.clear()  # the setter insists on it
-                image.points2D = pycolmap.Image(keypoints=xy.astype(np.float64)).points2D
-        add_points(model, self.images.ids, self.points, self.colors)
-        return model
+        return reconstruction_of(self.arrays())
+
+    def arrays(self) -> ModelArrays:
+        """Return the model with its points."""
+        model, keypoints = put_images(self.template.model, self.images), self._keypoints()
+        every = [keypoints(row) for row in range(len(model.images.ids))]
+        heads, tracks = zip((np.zeros(0, POINT3D), np.zeros((0, 2), np.uint32)), *self._blocks(), strict=True)
+        return replace(
+            model,
+            starts=np.append(0, np.cumsum([len(one) for one in every])),
+            points2d=np.concatenate(every),
+            points=np.concatenate(heads),
+            tracks=np.concatenate(tracks),
+        )
 
     def write(self, folder: Path) -> None:
         """Write what `reconstruction` is into an existing folder, in the same bytes.
 
         Raises:
-            InputError, OSError: if the files cannot be written, or not completely.
+            InputError: if the files cannot be written, or not completely.
         """
-        write_model(self._without_points(), folder)
-        bare = (folder / "images.bin").read_bytes()
-        with (folder / "images.bin").open("wb") as stream:
-            stream.writelines(self._images_with_points(bare))
-        with (folder / "points3D.bin").open("wb") as stream:
-            stream.write(COUNT.pack(self.points.num_points))
-            for first in range(0, self.points.num_points, _POINTS_AT_ONCE):
-                stream.write(self._bytes_of_points(first, first + _POINTS_AT_ONCE))
+        model = put_images(self.template.model, self.images)
+        write_binary(model, folder, self._blocks(), self._keypoints())
 
-    def _without_points(self) -> pycolmap.Reconstruction:
-        """Return the model as the template has it, without points and with its own points2D."""
-        model = self.template.build()
-        put_images(model, self.images)
-        return model
-
-    def _images_with_points(self, bare: bytes) -> Iterator[bytes]:
-        """Yield the parts of images.bin, given what it is without points."""
-        row_of = {image_id: row for row, image_id in enumerate(self.images.ids.tolist())}
+    def _keypoints(self) -> Callable[[int], Records]:
+        """Return what makes the points2D of the template's images by their rows."""
+        model = self.template.model
+        own = dict(
+            zip(model.images.rows(self.images.ids).tolist(), range(self.images.num_images), strict=True)
+        )
         rows_of, ids = self.points.rows_of_images(self.images.num_images), self.points.ids
-        seen, at = self.points.points_seen(), COUNT.size
-        yield bare[:at]
-        while at < len(bare):
-            row = row_of[int.from_bytes(bare[at : at + 4], "little")]
-            end = bare.index(b"\0", at + IMAGE.size) + 1
-            (count,) = COUNT.unpack_from(bare, end)
-            points2d = np.frombuffer(bare, POINT2D, count, end + COUNT.size).copy()
-            if len(self.keypoints[row]):
-                points2d = np.empty(len(self.keypoints[row]), POINT2D)
-                points2d["xy"] = self.keypoints[row]
-            points2d["point3d_id"] = NO_POINT
-            points2d["point3d_id"][self.points.keypoints[rows_of[row]]] = ids[seen[rows_of[row]]]
-            yield from (bare[at:end], COUNT.pack(len(points2d)), points2d.tobytes())
-            at = end + COUNT.size + count * POINT2D.itemsize
+        seen = self.points.points_seen()
 
-    def _bytes_of_points(self, first: int, last: int) -> bytes:
-        """Return the records of some points in points3D.bin."""
-        points, offsets = self.points, self.points.offsets[first : last + 1]
-        seen, lengths = slice(int(offsets[0]), int(offsets[-1])), np.diff(offsets)
-        heads = np.empty(len(lengths), POINT3D)
-        heads["id"], heads["xyz"] = points.ids[first:last], points.xyz[first:last]
-        heads["rgb"] = self.colors[first:last]
-        heads["error"] = -1.0 if points.errors_px is None else points.errors_px[first:last]
-        heads["length"] = lengths
-        tracks = np.empty((seen.stop - seen.start, 2), dtype="<u4")
-        tracks[:, 0], tracks[:, 1] = self.images.ids[points.images[seen]], points.keypoints[seen]
-        sizes = np.column_stack([np.full(len(lengths), POINT3D.itemsize), 8 * lengths]).ravel()
-        is_head = np.repeat(np.tile([True, False], len(lengths)), sizes)
-        data = np.empty(len(is_head), dtype=np.uint8)
-        data[is_head], data[~is_head] = heads.view(np.uint8), tracks.view(np.uint8).ravel()
-        return data.tobytes()
+        def of_image(row: int) -> Records:
+            k = own.get(row)
+            if k is None:
+                return model.keypoints(row)
+            records = model.keypoints(row).copy()
+            if len(self.keypoints[k]):
+                records = np.full(len(self.keypoints[k]), NO_POINT, POINT2D)
+                records["xy"], records["point3d_id"] = self.keypoints[k], NO_POINT
+            records["point3d_id"][self.points.keypoints[rows_of[k]]] = ids[seen[rows_of[k]]]
+            return records
+
+        return of_image
+
+    def heads(self, rows: IntArray) -> Records:
+        """Return some points (r,) as `POINT3D`."""
+        heads, points = np.empty(len(rows), POINT3D), self.points
+        heads["id"], heads["xyz"], heads["rgb"] = points.ids[rows], points.xyz[rows], self.colors[rows]
+        heads["error"] = -1.0 if points.errors_px is None else points.errors_px[rows]
+        heads["length"] = points.lengths()[rows]
+        return heads
+
+    def _blocks(self) -> Iterator[tuple[Records, UInt32Array]]:
+        """Yield points and their tracks, some at a time."""
+        points = self.points
+        for first in range(0, points.num_points, AT_ONCE):
+            rows = np.arange(first, min(first + AT_ONCE, points.num_points))
+            seen = slice(int(points.offsets[first]), int(points.offsets[rows[-1] + 1]))
+            tracks = np.empty((seen.stop - seen.start, 2), dtype=np.uint32)
+            tracks[:, 0], tracks[:, 1] = self.images.ids[points.images[seen]], points.keypoints[seen]
+            yield self.heads(rows), tracks
 
 
 def _narrowed(xy: FloatArray | None) -> FloatArray | npt.NDArray[np.float32]:
@@ -176,59 +174,44 @@ def _narrowed(xy: FloatArray | None) -> FloatArray | npt.NDArray[np.float32]:
     return narrow if (narrow == xy).all() else xy
 
 
-def transform_model(
-    reconstruction: pycolmap.Reconstruction, similarity: Similarity
-) -> pycolmap.Reconstruction:
-    """Return the model under a similarity: cameras and points, and sensors in rigs if it scales."""
-    copy = pycolmap.Reconstruction(reconstruction)
-    rotation = pycolmap.Rotation3d(similarity.rotation)
-    copy.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
-    return copy
-
-
-def pick_points(model: SeededModel | pycolmap.Reconstruction, most: int) -> PickedPoints:
+def pick_points(model: SeededModel | ModelArrays | pycolmap.Reconstruction, most: int) -> PickedPoints:
     """Return at most so many points, evenly picked by id."""
-    num_all = model.num_points3D()
+    if isinstance(model, pycolmap.Reconstruction):
+        model, _ = arrays_of(model)
+    num_all = model.num_points3D() if isinstance(model, SeededModel) else len(model.points)
     count = min(num_all, most)
     rows = np.arange(count) * num_all // max(count, 1)
-    if isinstance(model, SeededModel):
-        points, unknown = model.points, np.full(num_all, -1.0)
-        return PickedPoints(
-            xyz=points.xyz[rows],
-            colors=model.colors[rows],
-            lengths=points.lengths()[rows],
-            errors_px=(unknown if points.errors_px is None else points.errors_px)[rows],
-            num_all=num_all,
-        )
-    ids = sorted(model.point3D_ids())
-    chosen = [model.point3D(ids[k]) for k in rows.tolist()]
+    heads = model.heads(rows) if isinstance(model, SeededModel) else model.points[rows]
     return PickedPoints(
-        xyz=np.array([point.xyz for point in chosen]).reshape(-1, 3),
-        colors=np.array([point.color for point in chosen], dtype=np.uint8).reshape(-1, 3),
-        lengths=np.array([point.track.length() for point in chosen], dtype=np.int64),
-        errors_px=np.array([point.error for point in chosen], dtype=np.float64),
+        xyz=heads["xyz"].copy(),
+        colors=heads["rgb"].copy(),
+        lengths=heads["length"].astype(np.int64),
+        errors_px=heads["error"].copy(),
         num_all=num_all,
     )
 
 
-def write_model(model: SeededModel | pycolmap.Reconstruction, folder: Path, *, text: bool = False) -> None:
-    """Write a model in COLMAP's binary or text format into an existing folder, and walk the files once more.
+def write_model(
+    model: SeededModel | ModelArrays | pycolmap.Reconstruction, folder: Path, *, text: bool = False
+) -> None:
+    """Write a model in COLMAP's binary format, or as text, into an existing folder.
 
-    pycolmap does not notice a disk that is full, hence the second look.
+    Text is read once more, for pycolmap, which writes it, does not notice a disk that is full.
 
     Raises:
-        InputError: if the files cannot be written, or are not complete afterwards.
+        InputError: if the files cannot be written, or not completely.
     """
     if isinstance(model, SeededModel):
         model.write(folder)
         return
+    if isinstance(model, pycolmap.Reconstruction):
+        model, _ = arrays_of(model)
+    if not text:
+        write_binary(model, folder)
+        return
     try:
-        (model.write_text if text else model.write_binary)(folder)
-    except PYCOLMAP_ERRORS as error:
-        raise InputError(f"{folder} cannot be written; check its permissions and the free space") from error
-    try:
-        check_model_files(folder)
-    except InputError as error:
-        raise InputError(
-            f"the model in {folder} could not be written completely; check the free space"
-        ) from error
+        reconstruction_of(model).write_text(folder)
+        read_folder(folder)
+    except (InputError, *PYCOLMAP_ERRORS) as error:
+        reason = f"the model in {folder} could not be written completely"
+        raise InputError(f"{reason}; check the free space and permissions") from error

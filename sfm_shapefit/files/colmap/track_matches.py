@@ -7,10 +7,9 @@ keypoints gives no match for that point: it is unknown which one is right.
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
-from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.points import observed_points, points2d_xy, points_of
+from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import (
@@ -33,13 +32,13 @@ class TrackMatches(Matches):
     def __init__(self, model: ColmapModel) -> None:
         """Collect what the images observe, and count the matches of each pair."""
         super().__init__()
-        self.lacking = "" if model.reconstruction.num_points3D() else "; ".join(model.notes)
+        self.lacking = "" if model.num_points else "; ".join(model.notes)
         self.names = model.images.names
-        images = [model.reconstruction.image(i) for i in model.images.ids.tolist()]
-        self._model, self._images = model.reconstruction, dict(zip(self.names, images, strict=True))
-        self.num_keypoints = np.array([image.num_points2D() for image in images], dtype=np.int64)
+        self._model, rows = model.arrays, model.arrays.images.rows(model.images.ids)
+        self._rows = dict(zip(self.names, rows.tolist(), strict=True))
+        self.num_keypoints = np.diff(model.arrays.starts)[rows]
         self.total_keypoints = int(self.num_keypoints.sum())
-        seen = [model.observed.get(image.image_id) or observed_points(image) for image in images]
+        seen = [model.arrays.observed(row) for row in rows.tolist()]
         points = np.concatenate([ids for _, ids in seen])
         image_of = np.repeat(np.arange(len(seen)), [len(ids) for _, ids in seen])
         order = np.argsort(points, kind="stable")
@@ -54,7 +53,7 @@ class TrackMatches(Matches):
         _, sizes = np.unique(points[once], return_counts=True)
         self._following = np.repeat(np.cumsum(sizes), sizes) - np.arange(len(self._image_of)) - 1
         self._by_image = np.argsort(self._image_of, kind="stable")
-        self._starts = np.append(0, np.cumsum(np.bincount(self._image_of, minlength=len(images))))
+        self._starts = np.append(0, np.cumsum(np.bincount(self._image_of, minlength=len(rows))))
         self.pairs, self.num_matches = self._count()
 
     def at(self, images: Images, left_out: PairNames = frozenset(), reading: Reading = PLENTY) -> View:
@@ -67,10 +66,7 @@ class TrackMatches(Matches):
 
     def keypoints(self, name: str) -> FloatArray:
         """Return the pixels (k, 2) of the points of an image."""
-        xy = points2d_xy(self._images[name])
-        if not np.isfinite(xy).all():
-            raise InputError(f"image {name} has a point whose coordinates are not finite")
-        return xy
+        return np.ascontiguousarray(self._model.keypoints(self._rows[name])["xy"])
 
     def rays(self, lens: Lens, pixels: FloatArray) -> FloatArray:
         """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for those without."""
