@@ -92,6 +92,9 @@ class ModelInArrays(Protocol):
     def as_it_is(self) -> Any:
         """The reconstruction, which may have been changed, if it is made; else the model itself."""
 
+    def colored(self, pictures: Any) -> tuple["ModelInArrays", tuple[str, ...]]:
+        """Return the model with colors of pictures, and the names of those that cannot be read."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inputs:

@@ -1,6 +1,6 @@
 """Seeded models: cameras, rigs and image names of the input, our poses and points."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from sfm_shapefit.files.colmap.binary_records import COUNT, IMAGE, NO_POINT, POI
 from sfm_shapefit.files.colmap.check import check_model_files
 from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS
+from sfm_shapefit.files.colmap.picture_colors import Pictures, color_model, colors_of_pictures
 from sfm_shapefit.files.colmap.point_colors import color_points
 from sfm_shapefit.files.colmap.points import Keypoints, add_points, points2d_xy
 from sfm_shapefit.files.colmap.template import Template
@@ -70,15 +71,27 @@ class SeededModel:
         """
         keypoints = keypoints or (lambda _: None)
         own = tuple(_narrowed(keypoints(k)) for k in range(images.num_images))
-        there = {image.image_id: image for image in template.images}
-        ids = images.ids.tolist()
+        colors, bare = np.zeros((points.num_points, 3), dtype=np.uint8), replace(template, colors=None)
+        seed = cls(template=bare, images=images, points=points, colors=colors, keypoints=own)
+        return replace(seed, colors=color_points(points, images.ids.tolist(), seed._pixels, template.colors))
 
-        def pixels(image: int) -> FloatArray:
-            return own[image].astype(np.float64) if len(own[image]) else points2d_xy(there[ids[image]])
+    @cached_property
+    def _pixels(self) -> Callable[[int], FloatArray]:
+        """What returns the points2D (k, 2) of an image by its row."""
+        there = {image.image_id: image for image in self.template.images}
+        own, ids = self.keypoints, self.images.ids.tolist()
+        return lambda k: own[k].astype(np.float64) if len(own[k]) else points2d_xy(there[ids[k]])
 
-        colors = color_points(points, ids, pixels, template.colors)
-        bare = replace(template, colors=None)
-        return cls(template=bare, images=images, points=points, colors=colors, keypoints=own)
+    def colored(self, pictures: Pictures) -> tuple[Self, tuple[str, ...]]:
+        """Return the model whose points without a color have that of pictures, and unreadable ones' names."""
+        if "reconstruction" in vars(self):  # whoever asked for it may have changed it
+            model, unread = color_model(self.reconstruction, pictures)
+            fresh = replace(self)
+            vars(fresh)["reconstruction"] = model
+            return fresh, unread
+        known = self.points, self.images, self._pixels, self.colors
+        colors, unread = colors_of_pictures(*known, pictures)
+        return replace(self, colors=colors), unread
 
     def num_reg_images(self) -> int:
         """Return how many images have a pose; this and the next two are as of a reconstruction."""
