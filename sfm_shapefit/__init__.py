@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.map import map_database
     from sfm_shapefit.pipeline.place import place
     from sfm_shapefit.pipeline.relative_rotations import relative_rotations
+    from sfm_shapefit.pipeline.workspace import Workspace, workspace
     from sfm_shapefit.pipeline.write import WriteOptions, write_result
     from sfm_shapefit.placement.options import GaugeOptions
     from sfm_shapefit.placement.place import Placement
@@ -82,6 +83,7 @@ _HOMES = {
     "pipeline.locate": ("locate",),
     "pipeline.map": ("map_database",),
     "pipeline.relative_rotations": ("relative_rotations",),
+    "pipeline.workspace": ("Workspace", "workspace"),
     "pipeline.write": ("WriteOptions", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "facts.options": ("InspectOptions", "JoinOptions", "LocateOptions", "MapOptions", "SourceOptions"),
@@ -136,6 +138,7 @@ __all__ = [
     "TrustOptions",
     "UnsolvableError",
     "ViewGraph",
+    "Workspace",
     "WriteOptions",
     "average_database",
     "average_rotations",
@@ -154,6 +157,7 @@ __all__ = [
     "place",
     "relative_rotations",
     "solve",
+    "workspace",
     "write_result",
 ]
 

@@ -274,7 +274,6 @@ class LocateResult(_Placed):
             ),
             num_points=model.num_points3D(),
             mean_reprojection_error_px=model.compute_mean_reprojection_error(),
-            has_panoramas=any(lens.is_panorama for lens in self.placed.lenses),
             num_points_as_nodes=int(np.sum(placement.nodes >= placement.num_cameras)),
             scale=gauge.statement,
             scale_sigma=gauge.scale_sigma,

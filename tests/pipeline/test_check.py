@@ -48,7 +48,7 @@ def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path, ring_ma
     drawing, facts = found.drawing, found.facts
     assert facts.verdict.statement == "good"
     assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
-    assert "image_undistorter" in banner(drawing, facts)["command"]
+    assert " workspace " in banner(drawing, facts)["command"]
 
     moved, name = with_one_displaced(tmp_path / "moved")
     found = check(moved, RING / "database.db", second_opinion=ring_mapped)
@@ -120,11 +120,11 @@ def test_what_map_doubts_check_does_not_call_good():
             "at least half as much speaks for another place or rotation"
             in found.facts.evidence.second.statement
         )
-        assert "image_undistorter" in found.facts.next_step.command  # it would be placed there again
+        assert " workspace " in found.facts.next_step.command  # it would be placed there again
         assert banner(found.drawing, found.facts)["sentence"].startswith("0004.jpg, 0005.jpg may be wrong")
         evidence = found.facts.evidence
         unlike = replace(evidence, second=replace(evidence.second, has_nothing_in_common=True))
-        assert "image_undistorter" not in replace(found.facts, evidence=unlike).next_step.command
+        assert " workspace " not in replace(found.facts, evidence=unlike).next_step.command
 
 
 def test_a_weak_camera_that_stands_where_another_model_has_it_is_not_named(monkeypatch):

@@ -1,0 +1,338 @@
+"""Pictures and models without distortion, as splatting and dense reconstruction take them. A door to OpenCV.
+
+A lens becomes one pinhole, or faces where it sees more than one holds: panoramas the six of a cube, fisheyes
+two or four that are turned aside and overlap in the middle. Principal points are in the middle of the
+pictures, since 3DGS takes them to be there. Faces of one picture are a rig.
+"""
+
+import itertools
+import math
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.paths import file_of
+from sfm_shapefit.files.colmap.images import bytes_of_name, images_of, name_of, sensor_id
+from sfm_shapefit.files.colmap.lenses import lens_of, rays_of
+from sfm_shapefit.files.colmap.picture_colors import read_picture
+from sfm_shapefit.files.colmap.points import add_points, points2d_of, points_of
+from sfm_shapefit.files.colmap.quiet import quiet_log
+from sfm_shapefit.scene.points import Points
+
+# Radians off the axis, in the middle of a side: there, a pinhole stretches pixels outward by 1 / cos^2 = 4.
+_WIDEST = math.radians(60.0)
+_HALF_FACE = math.radians(45.0)  # radians, half the angle of view of a face
+_NARROWEST = 0.5  # share of that; a smaller face that keeps within its picture is none
+_CUBE = {
+    "front": (0, 0),
+    "right": (90, 0),
+    "back": (180, 0),
+    "left": (-90, 0),
+    "up": (0, 90),
+    "down": (0, -90),
+}
+_SAME_PX = 1.0  # pixels off the middle; a principal point no farther off is there
+_WRITTEN = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}  # suffixes of pictures; others become .png
+_MAPS_AT_ONCE = 6  # tables of where pixels come from; each takes 8 bytes a pixel
+_JPEG_QUALITY = 95  # percent, JPEG's own scale; blocks are not seen
+
+Maps = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+
+
+class Pinhole(NamedTuple):
+    """What of a lens's pictures becomes one picture."""
+
+    name: str
+    """Of the face; empty where it is the only one."""
+    camera: pycolmap.Camera
+    turn: FloatArray
+    """(3, 3) from axes of the lens to its own."""
+    is_same: bool = False
+    """Whether pictures stay as they are."""
+
+    def project(self, rays: FloatArray) -> FloatArray:
+        """Return the pixels (k, 2) of rays (k, 3) in axes of the lens; NaN beyond the picture."""
+        xy = np.array(self.camera.img_from_cam(np.ascontiguousarray(rays @ self.turn.T))).reshape(-1, 2)
+        with np.errstate(invalid="ignore"):
+            inside = ((xy >= 0.0) & (xy <= [self.camera.width, self.camera.height])).all(axis=1)
+        xy[~inside] = np.nan
+        return xy
+
+
+def pinholes_of(camera: pycolmap.Camera) -> list[Pinhole]:
+    """Return what pictures through a lens become."""
+    lens = lens_of(camera)
+    if lens.is_panorama:
+        size = 2 * round(lens.focal_px)  # as fine in the middle as the panorama is
+        return [Pinhole(name, *_face(size, np.ones(2), *at)) for name, at in _CUBE.items()]
+    width, height = camera.width, camera.height
+    sides = np.array([[0, height / 2], [width, height / 2], [width / 2, 0], [width / 2, height]], dtype=float)
+    rays = rays_of(lens, sides)
+    off = np.nan_to_num(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]), nan=np.pi / 2)
+    across, along = np.minimum(off.reshape(2, 2).min(axis=1), np.pi / 2).tolist()
+    if lens.is_plane or max(across, along) <= _WIDEST:
+        return [_whole(camera)]
+    return _turned_faces(camera, across, along)
+
+
+def _whole(camera: pycolmap.Camera) -> Pinhole:
+    """Return a lens without distortion, as pycolmap has it, cut to have its principal point in the middle."""
+    made = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    center, size = np.array(made.params[2:]), np.array([made.width, made.height])
+    if camera.is_undistorted() and np.abs(center - size / 2).max() <= _SAME_PX:
+        return Pinhole("", made, np.eye(3), is_same=True)
+    width, height = (2 * np.floor(np.minimum(center, size - center)).astype(int)).tolist()
+    made.width, made.height = width, height
+    made.params = [*made.params[:2], width / 2, height / 2]
+    return Pinhole("", made, np.eye(3))
+
+
+def _turned_faces(camera: pycolmap.Camera, across: float, along: float) -> list[Pinhole]:
+    """Return faces of a lens that sees so far off its axis, in radians, to left and right, above and below.
+
+    Each is as large as it can be without pixels that the picture lacks.
+    """
+    yaw, pitch = np.degrees(np.maximum(np.array([across, along]) - _HALF_FACE, 0.0))
+    turns = [("right", yaw, 0.0), ("left", -yaw, 0.0)] * (across > _WIDEST)
+    turns += [("up", 0.0, pitch), ("down", 0.0, -pitch)] * (along > _WIDEST)
+    shape = np.minimum(1.0, np.tan(np.minimum([across, along], _HALF_FACE)))
+    found = []
+    for name, *at in turns:
+        for share in np.arange(1.0, _NARROWEST, -0.02):
+            face = Pinhole(name, *_face(2 * round(camera.mean_focal_length()), share * shape, *at))
+            if _lies_inside(camera, face):
+                found.append(face)
+                break
+    return found or [_whole(camera)]
+
+
+def _face(size: int, shape: FloatArray, yaw: float, pitch: float) -> tuple[pycolmap.Camera, FloatArray]:
+    """Return a face with the focal length size / 2, and its turn, right and up in degrees.
+
+    `shape` (2,) is half its width and height at distance 1.
+    """
+    turn = Rotation.from_euler("yx", [yaw, pitch], degrees=True).as_matrix().T
+    width, height = (2 * np.floor(size / 2 * shape).astype(int)).tolist()
+    params = [size / 2, size / 2, width / 2, height / 2]
+    return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params), turn
+
+
+def _maps_of(camera: pycolmap.Camera, pinhole: Pinhole) -> Maps:
+    """Return where the pixels of a picture come from, as OpenCV counts them."""
+    width, height = pinhole.camera.width, pinhole.camera.height
+    found = np.empty((height, width, 2), dtype=np.float32)
+    for y in range(height):  # all at once would take ten times the memory
+        found[y] = _sources(camera, pinhole, np.arange(width), np.full(width, y))
+    return found[..., 0], found[..., 1]
+
+
+def _lies_inside(camera: pycolmap.Camera, pinhole: Pinhole) -> bool:
+    """Return whether the border of a picture comes from inside that of a camera."""
+    width, height = pinhole.camera.width, pinhole.camera.height
+    x, y = np.arange(width), np.arange(height)
+    ends = np.repeat([0, height - 1], width), np.repeat([0, width - 1], height)
+    found = _sources(camera, pinhole, np.append(np.tile(x, 2), ends[1]), np.append(ends[0], np.tile(y, 2)))
+    return bool(((found >= 0.0) & (found <= [camera.width - 1, camera.height - 1])).all())
+
+
+def _sources(camera: pycolmap.Camera, pinhole: Pinhole, x: IntArray, y: IntArray) -> FloatArray:
+    """Return where pixels (k,) come from, (k, 2), with centers of pixels at whole numbers; far off of none."""
+    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1)
+    rays[:, :2] = (rays[:, :2] - pinhole.camera.params[2:]) / pinhole.camera.params[:2]
+    xy = camera.img_from_cam(np.ascontiguousarray(rays @ pinhole.turn), check_cheirality=False)
+    return np.nan_to_num(np.asarray(xy) - 0.5, nan=-9.0)
+
+
+class Flat(NamedTuple):
+    """An image of a model, and the pictures that it becomes."""
+
+    name: str
+    image_id: int
+    file: Path
+    camera: pycolmap.Camera
+    pinholes: Sequence[Pinhole]
+    names: Sequence[str]
+    """Of the pictures, one for each pinhole."""
+
+
+def flats_of(model: pycolmap.Reconstruction, folder: Path) -> tuple[list[Flat], list[str]]:
+    """Return what posed images with a picture in a folder become, by name, and the names of the others."""
+    pinholes = {k: pinholes_of(model.camera(k)) for k in {i.camera_id for i in model.images.values()}}
+    flats, others, taken = list[Flat](), list[str](), set[str]()
+    for name, image_id in sorted((name_of(model.image(i)), i) for i in model.reg_image_ids()):
+        camera_id, file = model.image(image_id).camera_id, file_of(folder, name)
+        if file is None:
+            others.append(name)
+            continue
+        names = _flat_names(name, pinholes[camera_id], taken)
+        flats.append(Flat(name, image_id, file, model.camera(camera_id), pinholes[camera_id], names))
+    return flats, others
+
+
+def _flat_names(name: str, pinholes: Sequence[Pinhole], taken: set[str]) -> list[str]:
+    """Return names in one folder, where 3DGS looks for them; `taken` has those in use, and gets these."""
+    stem, suffix = os.path.splitext(name.replace("/", "_").replace("\\", "_"))
+    suffix, found = suffix if suffix.lower() in _WRITTEN else ".png", []
+    for pinhole in pinholes:
+        own = f"{stem}_{pinhole.name}" if pinhole.name else stem
+        others = (f"{own}_{k}{suffix}" for k in itertools.count(2))
+        found.append(next(one for one in itertools.chain([f"{own}{suffix}"], others) if one not in taken))
+        taken.add(found[-1])
+    return found
+
+
+def write_flats(flats: Sequence[Flat], folder: Path, threads: int) -> Iterator[str]:
+    """Write pictures, and yield for each image why it could not be done; empty where it was done.
+
+    Raises:
+        InputError: if a picture cannot be written.
+    """
+    cameras = {flat.camera.camera_id: (flat.camera, flat.pinholes) for flat in flats}
+
+    @lru_cache(_MAPS_AT_ONCE)
+    def maps_of(camera_id: int, k: int) -> Maps:
+        camera, pinholes = cameras[camera_id]
+        return _maps_of(camera, pinholes[k])
+
+    with quiet_log(), ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(lambda flat: _write_flat(flat, folder, maps_of), flats)
+
+
+def _write_flat(flat: Flat, folder: Path, maps_of: Callable[[int, int], Maps]) -> str:
+    picture = read_picture(flat.file)
+    if picture is None:
+        return "cannot be read"
+    if picture.shape[:2] != (flat.camera.height, flat.camera.width):
+        return "is not as large as its camera says"
+    edge = cv2.BORDER_WRAP if flat.camera.is_spherical() else cv2.BORDER_REPLICATE
+    for k, (pinhole, name) in enumerate(zip(flat.pinholes, flat.names, strict=True)):
+        if pinhole.is_same and flat.file.suffix == Path(name).suffix:
+            shutil.copyfile(flat.file, folder / name)
+            continue
+        pixels = cv2.remap(picture, *maps_of(flat.camera.camera_id, k), cv2.INTER_CUBIC, borderMode=edge)
+        bitmap = pycolmap.Bitmap.from_array(pixels)
+        bitmap.set_jpeg_quality(_JPEG_QUALITY)
+        if not bitmap.write(os.fsencode(folder / name)):
+            raise InputError(f"{folder / name} cannot be written; check the free space")
+    return ""
+
+
+def flatten_model(model: pycolmap.Reconstruction, flats: Sequence[Flat]) -> pycolmap.Reconstruction:
+    """Return the model of the pictures that images become, in the same world; other images are left out.
+
+    An observation goes to the first picture that shows it; a point stays if two pictures see it.
+    """
+    made, by_id = pycolmap.Reconstruction(), {flat.image_id: flat for flat in flats}
+    pinholes = {flat.camera.camera_id: flat.pinholes for flat in flats}
+    camera_ids = _new_ids({k: len(own) for k, own in pinholes.items()}, model.cameras)
+    for (camera_id, k), new_id in camera_ids.items():
+        camera = pycolmap.Camera(pinholes[camera_id][k].camera.todict())
+        camera.camera_id = new_id
+        made.add_camera(camera)
+    moved = {rig_id: _add_rig(made, rig, pinholes, camera_ids) for rig_id, rig in sorted(model.rigs.items())}
+    image_ids = _new_ids({i: len(flat.pinholes) for i, flat in by_id.items()}, model.images)
+    points, keypoints = _share_points(model, by_id)
+    for frame_id in sorted({model.image(i).frame_id for i in by_id}):
+        before = model.frame(frame_id)
+        frame = pycolmap.Frame(frame_id=frame_id, rig_id=before.rig_id)
+        own = sorted(
+            (i, k)
+            for i in (d.id for d in before.image_ids)
+            if i in by_id
+            for k in range(len(by_id[i].pinholes))
+        )
+        images = []
+        for i, k in own:
+            ids = {"image_id": image_ids[i, k], "camera_id": camera_ids[by_id[i].camera.camera_id, k]}
+            images.append(
+                pycolmap.Image(name=bytes_of_name(by_id[i].names[k]), keypoints=keypoints[i, k], **ids)
+            )
+            frame.add_data_id(images[-1].data_id)
+            images[-1].frame_id = frame_id
+        frame.rig_from_world = _composed(moved[before.rig_id], before.rig_from_world)
+        made.add_frame(frame)
+        for image in images:
+            made.add_image(image)
+        made.register_frame(frame_id)
+    colors = np.array([model.point3D(i).color for i in points.ids.tolist()], dtype=np.uint8).reshape(-1, 3)
+    add_points(made, np.array([image_ids[key] for key in keypoints]), points, colors)
+    made.update_point_3d_errors()
+    return made
+
+
+def _new_ids(counts: Mapping[int, int], taken: Iterable[int]) -> dict[tuple[int, int], int]:
+    """Return ids for the parts of what is counted by id: the first keeps its own, others get new ones."""
+    fresh = itertools.count(max(taken) + 1)
+    return {(i, k): next(fresh) if k else i for i in sorted(counts) for k in range(counts[i])}
+
+
+def _add_rig(
+    made: pycolmap.Reconstruction,
+    rig: pycolmap.Rig,
+    pinholes: Mapping[int, Sequence[Pinhole]],
+    camera_ids: Mapping[tuple[int, int], int],
+) -> pycolmap.Rigid3d | None:
+    """Add the rig of what its cameras become, and return its pose in the old one; None without cameras."""
+    views = []
+    for camera_id in sorted(pinholes, key=lambda k: (not rig.is_ref_sensor(sensor_id(k)), k)):
+        sensor = sensor_id(camera_id)
+        if rig.has_sensor(sensor):
+            pose = pycolmap.Rigid3d() if rig.is_ref_sensor(sensor) else rig.sensor_from_rig(sensor)
+            for k, pinhole in enumerate(pinholes[camera_id]):
+                turn = pycolmap.Rigid3d(pycolmap.Rotation3d(pinhole.turn), np.zeros(3))
+                views.append((sensor_id(camera_ids[camera_id, k]), _composed(turn, pose)))
+    if not views:
+        return None
+    (first, moved), *others = views
+    new = pycolmap.Rig(rig_id=rig.rig_id)
+    new.add_ref_sensor(first)
+    for sensor, pose in others:
+        new.add_sensor(sensor, _composed(pose, moved.inverse()))
+    made.add_rig(new)
+    return moved
+
+
+def _composed(outer: pycolmap.Rigid3d | None, inner: pycolmap.Rigid3d | None) -> pycolmap.Rigid3d:
+    """Return outer after inner; `read_model` has refused what has no pose."""
+    assert outer is not None
+    assert inner is not None
+    return outer * inner
+
+
+def _share_points(
+    model: pycolmap.Reconstruction, by_id: Mapping[int, Flat]
+) -> tuple[Points, dict[tuple[int, int], FloatArray]]:
+    """Return the points, and the keypoints (k, 2) of the pictures that images become, by image and pinhole.
+
+    The points' images are the rows of these.
+    """
+    images = images_of(model)
+    points, pixels = points_of(model, images), points2d_of(model, images)
+    image_of, place_of = np.full(len(points.images), -1), np.full(len(points.images), -1)
+    keypoints: dict[tuple[int, int], FloatArray] = {}
+    for row, own in enumerate(points.rows_of_images(images.num_images)):
+        flat = by_id.get(int(images.ids[row]))
+        if flat is None:
+            continue
+        keypoints_there = np.asarray(pixels(row))[points.keypoints[own]]
+        rays = rays_of(images.lenses[images.lens_of[row]], keypoints_there)
+        for k, pinhole in enumerate(flat.pinholes):
+            xy = pinhole.project(rays)
+            seen = np.isfinite(xy[:, 0]) & (place_of[own] < 0)
+            image_of[own[seen]], place_of[own[seen]] = len(keypoints), np.arange(seen.sum())
+            keypoints[flat.image_id, k] = xy[seen]
+    shared = replace(points, images=image_of, keypoints=place_of)
+    return shared.taken(shared.paired(place_of >= 0)), keypoints
