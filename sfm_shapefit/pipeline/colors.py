@@ -9,13 +9,13 @@ from sfm_shapefit.base.paths import file_of, refuse_no_folder
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.map_result import JoinedModel, MapResult
 from sfm_shapefit.facts.result import GraphResult, LocateResult
-from sfm_shapefit.files.colmap.picture_colors import Pictures, color_model
+from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
 from sfm_shapefit.files.colmap.seed import pick_points
 from sfm_shapefit.solver.options import SolverOptions
 
 Result = TypeVar("Result", bound=LocateResult | GraphResult | MapResult | JoinedModel)
 
-_PICKED = 1000  # points that are asked whether they have a color
+_PICKED = 1000  # points that are asked for a color; one that has it is enough
 
 
 def has_colors(found: LocateResult | GraphResult | MapResult | JoinedModel) -> bool:
@@ -42,7 +42,7 @@ def with_colors(found: Result, images: Path | str) -> Result:
     if isinstance(found, GraphResult):
         return found
     refuse_no_folder(Path(images))
-    pictures = Pictures(Path(images), SolverOptions().num_threads())
+    pictures = PictureFolder(Path(images), SolverOptions().num_threads())
     unread: set[str] = set()
     colored: Any = _colored(found, pictures, unread)
     warnings = [*found.warnings, *_warnings(pictures.folder, found.image_names, sorted(unread))]
@@ -54,7 +54,7 @@ def with_colors(found: Result, images: Path | str) -> Result:
     return result
 
 
-def _colored(found: Any, pictures: Pictures, unread: set[str]) -> Any:
+def _colored(found: Any, pictures: PictureFolder, unread: set[str]) -> Any:
     """Return a result with colors; names of unreadable pictures are added to `unread`."""
     if isinstance(found, MapResult):
         models = [replace(one, located=_colored(one.located, pictures, unread)) for one in found.models]

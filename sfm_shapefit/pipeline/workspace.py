@@ -22,7 +22,7 @@ from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, model_of, read_model
-from sfm_shapefit.files.colmap.picture_colors import Pictures, color_model
+from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
 from sfm_shapefit.files.colmap.pinholes import flats_of, flatten_model, write_flats
 from sfm_shapefit.files.colmap.seed import pick_points, transform_model, write_model
 from sfm_shapefit.files.nerf import nerf_text
@@ -41,8 +41,8 @@ LEVELS: tuple[Level, ...] = get_args(Level)
 
 _LEVEL_DEG = 5.0  # degrees; a model whose z axis is no farther from up has it from GPS, gravity or its maker
 _ROUGH_DEG = 3.0  # degrees, standard deviation; ground that is tilted by more is seen to be
-_PARTNERS = 20  # images that the stereo of one looks at, as COLMAP's undistorter has it
-_MOST_POINTS = 3000  # points that are asked where the ground is
+_PARTNERS = 20  # images that the stereo of one looks at; COLMAP's undistorter says as many
+_MOST_POINTS = 3000  # points that are asked where the ground is; more say the same
 _POINTS = "points3D.ply"
 _STEREO = ("depth_maps", "normal_maps", "consistency_graphs")
 
@@ -61,14 +61,11 @@ class Workspace:
 
     @property
     def told(self) -> list[str]:
-        """What the terminal says."""
+        """What the terminal says, in lines."""
         model = self.reconstruction
         counts = f"{counted(model.num_reg_images(), 'picture')}, {counted(model.num_points3D(), 'point')}"
-        return [
-            f"{counts}; {self.level}",
-            *(f"warning: {one}" for one in self.warnings),
-            f"written to {self.folder}/",
-        ]
+        warnings = [f"warning: {one}" for one in self.warnings]
+        return [counts, f"level: {self.level}", *warnings, f"written to {self.folder}/"]
 
 
 def workspace(
@@ -118,7 +115,7 @@ def workspace(
                     f"{images} has no picture of the model ({name} {why}): is it the right folder?"
                 )
         with clock("model"):
-            colored, _ = color_model(leveled, Pictures(Path(images), clock.threads))
+            colored, _ = color_model(leveled, PictureFolder(Path(images), clock.threads))
             made = flatten_model(colored, flats)
             _write_models(read_model(made), folder)
     return Workspace(

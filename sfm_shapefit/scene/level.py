@@ -21,14 +21,15 @@ from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, median_spread, normaliz
 
 _LEAST_ROLL = np.radians(0.1)  # radians; nobody holds a camera better
 _MEANT = np.radians(10.0)  # radians; a picture that is rolled by more is meant to be
-_GROUND = np.radians(2.0)  # radians, standard deviation of the slope of what counts as level ground
-_TILT = np.radians(10.0)  # radians, of how far all cameras together look up or down
+_GROUND = np.radians(2.0)  # radians, standard deviation of the slope of the ground; yards drain by as much
+_TILT = np.radians(10.0)  # radians; all cameras together may look down, on a table, or up, at a tower
 _NUM_DRAWS = 1000  # planes through three points; of points a fifth of which are ground, eight have no other
 _THICKNESS = 0.03  # median spreads of the points; those that are no farther from a plane are on it
-_GROUND_SHARE, _FEWEST_POINTS = 0.15, 50  # of the points; a plane of fewer may be any wall or table
-_STEEPEST = np.radians(25.0)  # radians between the ground's normal and what the pictures say of up
-_ROUNDS = 50  # rounds of reweighting, a bound
-_SEED = 0  # of the draws; any will do, if it is always the same
+_GROUND_SHARE = 0.15  # share of the points on the ground; a plane of fewer may be anything
+_FEWEST_POINTS = 50  # points; of fewer, chance puts as large a share on a plane
+_STEEPEST = np.radians(25.0)  # radians between up and the ground's normal; steeper planes are roofs and walls
+_ROUNDS = 50  # rounds of reweighting, a bound; they end once nothing moves
+_SEED = 0  # seed of the draws; any will do, if it is always the same
 
 
 class Up(NamedTuple):

@@ -276,7 +276,7 @@ def test_the_second_opinion_is_kept_where_asked_and_is_the_next_step(tmp_path):
     (model, name), out = with_one_displaced(tmp_path / "model"), tmp_path / "mapped"
     database, keep = ("--database", RING / "database.db"), ("--second-opinion", out)
     told = run("check", model, *database, *keep, code=0).stdout
-    assert f"--input_path {out}/0 " in told
+    assert f" workspace {out}/0 " in told
     assert pycolmap.Reconstruction(out / "0").num_reg_images() == 8
     assert (out / "map.json").is_file()
     assert "exists already" in run_refused("check", model, *database, *keep)

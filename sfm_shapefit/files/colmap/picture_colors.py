@@ -17,17 +17,17 @@ from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 
-Colors = npt.NDArray[np.uint8]
+Rgb = npt.NDArray[np.uint8]
 
 
-class Pictures(NamedTuple):
+class PictureFolder(NamedTuple):
     """Where the pictures of a model are, and how many threads read them."""
 
     folder: Path
     threads: int
 
 
-def read_picture(file: Path) -> Colors | None:
+def read_picture(file: Path) -> Rgb | None:
     """Return a picture (height, width, 3), red first, as COLMAP reads it; None if it is none."""
     try:
         bitmap = pycolmap.Bitmap.read(os.fsencode(file), as_rgb=True)
@@ -37,8 +37,8 @@ def read_picture(file: Path) -> Colors | None:
 
 
 def colors_of_pictures(
-    points: Points, images: Images, keypoints: Keypoints, known: Colors, pictures: Pictures
-) -> tuple[Colors, tuple[str, ...]]:
+    points: Points, images: Images, keypoints: Keypoints, known: Rgb, pictures: PictureFolder
+) -> tuple[Rgb, tuple[str, ...]]:
     """Return the colors (x, 3) of points, and the names of pictures that are there but cannot be read.
 
     Args:
@@ -75,7 +75,7 @@ def colors_of_pictures(
     return np.where(is_open[:, None], means, known), tuple(unread)
 
 
-def _sample(picture: Colors, keypoints: FloatArray, lens_px: FloatArray) -> FloatArray:
+def _sample(picture: Rgb, keypoints: FloatArray, lens_px: FloatArray) -> FloatArray:
     """Return the colors (k, 3), between centers of pixels interpolated, at keypoints (k, 2).
 
     Keypoints are in pixels of a lens whose pictures are `lens_px` (2,) wide and high, 0 if unknown; the
@@ -94,7 +94,7 @@ def _sample(picture: Colors, keypoints: FloatArray, lens_px: FloatArray) -> Floa
 
 
 def color_model(
-    model: pycolmap.Reconstruction, pictures: Pictures
+    model: pycolmap.Reconstruction, pictures: PictureFolder
 ) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
     """Return a copy whose black points have colors of pictures, and the names of unreadable ones."""
     copy, images = pycolmap.Reconstruction(model), images_of(model)

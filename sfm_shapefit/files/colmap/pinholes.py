@@ -9,12 +9,13 @@ import itertools
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,7 +35,7 @@ from sfm_shapefit.scene.points import Points
 
 # Radians off the axis, in the middle of a side: there, a pinhole stretches pixels outward by 1 / cos^2 = 4.
 _WIDEST = math.radians(60.0)
-_HALF_FACE = math.radians(45.0)  # radians, half the angle of view of a face
+_HALF_FACE = math.radians(45.0)  # radians, half the angle of view of a face; four close a circle
 _NARROWEST = 0.5  # share of that; a smaller face that keeps within its picture is none
 _CUBE = {
     "front": (0, 0),
@@ -56,7 +57,7 @@ class Pinhole(NamedTuple):
     """What of a lens's pictures becomes one picture."""
 
     name: str
-    """Of the face; empty where it is the only one."""
+    """Name of the face; empty where it is the only one."""
     camera: pycolmap.Camera
     turn: FloatArray
     """(3, 3) from axes of the lens to its own."""
@@ -143,13 +144,13 @@ def _lies_inside(camera: pycolmap.Camera, pinhole: Pinhole) -> bool:
     """Return whether the border of a picture comes from inside that of a camera."""
     width, height = pinhole.camera.width, pinhole.camera.height
     x, y = np.arange(width), np.arange(height)
-    ends = np.repeat([0, height - 1], width), np.repeat([0, width - 1], height)
-    found = _sources(camera, pinhole, np.append(np.tile(x, 2), ends[1]), np.append(ends[0], np.tile(y, 2)))
+    across, along = np.r_[x, x, 0 * y, 0 * y + width - 1], np.r_[0 * x, 0 * x + height - 1, y, y]
+    found = _sources(camera, pinhole, across, along)
     return bool(((found >= 0.0) & (found <= [camera.width - 1, camera.height - 1])).all())
 
 
 def _sources(camera: pycolmap.Camera, pinhole: Pinhole, x: IntArray, y: IntArray) -> FloatArray:
-    """Return where pixels (k,) come from, (k, 2), with centers of pixels at whole numbers; far off of none."""
+    """Return where pixels (k,) come from, (k, 2), counted from centers of pixels; outside if from nowhere."""
     rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], axis=1)
     rays[:, :2] = (rays[:, :2] - pinhole.camera.params[2:]) / pinhole.camera.params[:2]
     xy = camera.img_from_cam(np.ascontiguousarray(rays @ pinhole.turn), check_cheirality=False)
@@ -159,38 +160,37 @@ def _sources(camera: pycolmap.Camera, pinhole: Pinhole, x: IntArray, y: IntArray
 class Flat(NamedTuple):
     """An image of a model, and the pictures that it becomes."""
 
+    image: pycolmap.Image
     name: str
-    image_id: int
     file: Path
     camera: pycolmap.Camera
     pinholes: Sequence[Pinhole]
     names: Sequence[str]
-    """Of the pictures, one for each pinhole."""
+    """Names of the pictures, one for each pinhole."""
 
 
 def flats_of(model: pycolmap.Reconstruction, folder: Path) -> tuple[list[Flat], list[str]]:
     """Return what posed images with a picture in a folder become, by name, and the names of the others."""
-    pinholes = {k: pinholes_of(model.camera(k)) for k in {i.camera_id for i in model.images.values()}}
     flats, others, taken = list[Flat](), list[str](), set[str]()
+    pinholes = cache(lambda camera_id: pinholes_of(model.camera(camera_id)))
     for name, image_id in sorted((name_of(model.image(i)), i) for i in model.reg_image_ids()):
-        camera_id, file = model.image(image_id).camera_id, file_of(folder, name)
+        image, file = model.image(image_id), file_of(folder, name)
         if file is None:
             others.append(name)
             continue
-        names = _flat_names(name, pinholes[camera_id], taken)
-        flats.append(Flat(name, image_id, file, model.camera(camera_id), pinholes[camera_id], names))
+        own = pinholes(image.camera_id)
+        flats.append(Flat(image, name, file, model.camera(image.camera_id), own, _names(name, own, taken)))
     return flats, others
 
 
-def _flat_names(name: str, pinholes: Sequence[Pinhole], taken: set[str]) -> list[str]:
+def _names(name: str, pinholes: Sequence[Pinhole], taken: set[str]) -> list[str]:
     """Return names in one folder, where 3DGS looks for them; `taken` has those in use, and gets these."""
     stem, suffix = os.path.splitext(name.replace("/", "_").replace("\\", "_"))
-    suffix, found = suffix if suffix.lower() in _WRITTEN else ".png", []
-    for pinhole in pinholes:
-        own = f"{stem}_{pinhole.name}" if pinhole.name else stem
-        others = (f"{own}_{k}{suffix}" for k in itertools.count(2))
-        found.append(next(one for one in itertools.chain([f"{own}{suffix}"], others) if one not in taken))
-        taken.add(found[-1])
+    suffix = suffix if suffix.lower() in _WRITTEN else ".png"
+    found = [f"{stem}_{pinhole.name}{suffix}" if pinhole.name else f"{stem}{suffix}" for pinhole in pinholes]
+    if not taken.isdisjoint(found):
+        return _names(f"{stem}_{suffix}", pinholes, taken)
+    taken.update(found)
     return found
 
 
@@ -200,29 +200,28 @@ def write_flats(flats: Sequence[Flat], folder: Path, threads: int) -> Iterator[s
     Raises:
         InputError: if a picture cannot be written.
     """
-    cameras = {flat.camera.camera_id: (flat.camera, flat.pinholes) for flat in flats}
+    flat_of = {flat.camera.camera_id: flat for flat in flats}
 
     @lru_cache(_MAPS_AT_ONCE)
     def maps_of(camera_id: int, k: int) -> Maps:
-        camera, pinholes = cameras[camera_id]
-        return _maps_of(camera, pinholes[k])
+        return _maps_of(flat_of[camera_id].camera, flat_of[camera_id].pinholes[k])
 
     with quiet_log(), ThreadPoolExecutor(threads) as pool:
         yield from pool.map(lambda flat: _write_flat(flat, folder, maps_of), flats)
 
 
 def _write_flat(flat: Flat, folder: Path, maps_of: Callable[[int, int], Maps]) -> str:
-    picture = read_picture(flat.file)
+    camera, picture = flat.camera, read_picture(flat.file)
     if picture is None:
         return "cannot be read"
-    if picture.shape[:2] != (flat.camera.height, flat.camera.width):
+    if picture.shape[:2] != (camera.height, camera.width):
         return "is not as large as its camera says"
-    edge = cv2.BORDER_WRAP if flat.camera.is_spherical() else cv2.BORDER_REPLICATE
+    edge = cv2.BORDER_WRAP if camera.is_spherical() else cv2.BORDER_REPLICATE
     for k, (pinhole, name) in enumerate(zip(flat.pinholes, flat.names, strict=True)):
         if pinhole.is_same and flat.file.suffix == Path(name).suffix:
             shutil.copyfile(flat.file, folder / name)
             continue
-        pixels = cv2.remap(picture, *maps_of(flat.camera.camera_id, k), cv2.INTER_CUBIC, borderMode=edge)
+        pixels = cv2.remap(picture, *maps_of(camera.camera_id, k), cv2.INTER_CUBIC, borderMode=edge)
         bitmap = pycolmap.Bitmap.from_array(pixels)
         bitmap.set_jpeg_quality(_JPEG_QUALITY)
         if not bitmap.write(os.fsencode(folder / name)):
@@ -235,34 +234,27 @@ def flatten_model(model: pycolmap.Reconstruction, flats: Sequence[Flat]) -> pyco
 
     An observation goes to the first picture that shows it; a point stays if two pictures see it.
     """
-    made, by_id = pycolmap.Reconstruction(), {flat.image_id: flat for flat in flats}
-    pinholes = {flat.camera.camera_id: flat.pinholes for flat in flats}
-    camera_ids = _new_ids({k: len(own) for k, own in pinholes.items()}, model.cameras)
+    made, by_id = pycolmap.Reconstruction(), {flat.image.image_id: flat for flat in flats}
+    flat_of = {flat.camera.camera_id: flat for flat in flats}
+    camera_ids, image_ids = _new_ids(flat_of), _new_ids(by_id)
     for (camera_id, k), new_id in camera_ids.items():
-        camera = pycolmap.Camera(pinholes[camera_id][k].camera.todict())
+        camera = pycolmap.Camera(flat_of[camera_id].pinholes[k].camera.todict())
         camera.camera_id = new_id
         made.add_camera(camera)
-    moved = {rig_id: _add_rig(made, rig, pinholes, camera_ids) for rig_id, rig in sorted(model.rigs.items())}
-    image_ids = _new_ids({i: len(flat.pinholes) for i, flat in by_id.items()}, model.images)
+    moved = {rig_id: _add_rig(made, rig, flat_of, camera_ids) for rig_id, rig in sorted(model.rigs.items())}
     points, keypoints = _share_points(model, by_id)
-    for frame_id in sorted({model.image(i).frame_id for i in by_id}):
-        before = model.frame(frame_id)
+    frames = defaultdict[int, list[pycolmap.Image]](list)
+    for (i, k), xy in keypoints.items():
+        ids = {"image_id": image_ids[i, k], "camera_id": camera_ids[by_id[i].camera.camera_id, k]}
+        image = pycolmap.Image(name=bytes_of_name(by_id[i].names[k]), keypoints=xy, **ids)
+        image.frame_id = by_id[i].image.frame_id
+        frames[image.frame_id].append(image)
+    for frame_id, images in sorted(frames.items()):
+        before: Any = model.frame(frame_id)
         frame = pycolmap.Frame(frame_id=frame_id, rig_id=before.rig_id)
-        own = sorted(
-            (i, k)
-            for i in (d.id for d in before.image_ids)
-            if i in by_id
-            for k in range(len(by_id[i].pinholes))
-        )
-        images = []
-        for i, k in own:
-            ids = {"image_id": image_ids[i, k], "camera_id": camera_ids[by_id[i].camera.camera_id, k]}
-            images.append(
-                pycolmap.Image(name=bytes_of_name(by_id[i].names[k]), keypoints=keypoints[i, k], **ids)
-            )
-            frame.add_data_id(images[-1].data_id)
-            images[-1].frame_id = frame_id
-        frame.rig_from_world = _composed(moved[before.rig_id], before.rig_from_world)
+        for image in images:
+            frame.add_data_id(image.data_id)
+        frame.rig_from_world = moved[before.rig_id] * before.rig_from_world
         made.add_frame(frame)
         for image in images:
             made.add_image(image)
@@ -273,43 +265,36 @@ def flatten_model(model: pycolmap.Reconstruction, flats: Sequence[Flat]) -> pyco
     return made
 
 
-def _new_ids(counts: Mapping[int, int], taken: Iterable[int]) -> dict[tuple[int, int], int]:
-    """Return ids for the parts of what is counted by id: the first keeps its own, others get new ones."""
-    fresh = itertools.count(max(taken) + 1)
-    return {(i, k): next(fresh) if k else i for i in sorted(counts) for k in range(counts[i])}
+def _new_ids(flats: Mapping[int, Flat]) -> dict[tuple[int, int], int]:
+    """Return ids of the parts of what has an id: the first keeps its own, others get new ones."""
+    fresh = itertools.count(max(flats) + 1)
+    return {(i, k): next(fresh) if k else i for i in sorted(flats) for k in range(len(flats[i].pinholes))}
 
 
 def _add_rig(
     made: pycolmap.Reconstruction,
     rig: pycolmap.Rig,
-    pinholes: Mapping[int, Sequence[Pinhole]],
+    flat_of: Mapping[int, Flat],
     camera_ids: Mapping[tuple[int, int], int],
-) -> pycolmap.Rigid3d | None:
-    """Add the rig of what its cameras become, and return its pose in the old one; None without cameras."""
-    views = []
-    for camera_id in sorted(pinholes, key=lambda k: (not rig.is_ref_sensor(sensor_id(k)), k)):
+) -> Any:
+    """Add the rig of what cameras become, the first part as reference; return its pose in the old one."""
+    views: list[tuple[pycolmap.sensor_t, Any]] = []
+    for camera_id in sorted(flat_of, key=lambda k: (not rig.is_ref_sensor(sensor_id(k)), k)):
         sensor = sensor_id(camera_id)
         if rig.has_sensor(sensor):
-            pose = pycolmap.Rigid3d() if rig.is_ref_sensor(sensor) else rig.sensor_from_rig(sensor)
-            for k, pinhole in enumerate(pinholes[camera_id]):
+            pose: Any = pycolmap.Rigid3d() if rig.is_ref_sensor(sensor) else rig.sensor_from_rig(sensor)
+            for k, pinhole in enumerate(flat_of[camera_id].pinholes):
                 turn = pycolmap.Rigid3d(pycolmap.Rotation3d(pinhole.turn), np.zeros(3))
-                views.append((sensor_id(camera_ids[camera_id, k]), _composed(turn, pose)))
+                views.append((sensor_id(camera_ids[camera_id, k]), turn * pose))
     if not views:
         return None
-    (first, moved), *others = views
+    (reference, moved), *others = views
     new = pycolmap.Rig(rig_id=rig.rig_id)
-    new.add_ref_sensor(first)
+    new.add_ref_sensor(reference)
     for sensor, pose in others:
-        new.add_sensor(sensor, _composed(pose, moved.inverse()))
+        new.add_sensor(sensor, pose * moved.inverse())
     made.add_rig(new)
     return moved
-
-
-def _composed(outer: pycolmap.Rigid3d | None, inner: pycolmap.Rigid3d | None) -> pycolmap.Rigid3d:
-    """Return outer after inner; `read_model` has refused what has no pose."""
-    assert outer is not None
-    assert inner is not None
-    return outer * inner
 
 
 def _share_points(
@@ -327,12 +312,11 @@ def _share_points(
         flat = by_id.get(int(images.ids[row]))
         if flat is None:
             continue
-        keypoints_there = np.asarray(pixels(row))[points.keypoints[own]]
-        rays = rays_of(images.lenses[images.lens_of[row]], keypoints_there)
+        rays = rays_of(images.lenses[images.lens_of[row]], np.asarray(pixels(row))[points.keypoints[own]])
         for k, pinhole in enumerate(flat.pinholes):
             xy = pinhole.project(rays)
             seen = np.isfinite(xy[:, 0]) & (place_of[own] < 0)
             image_of[own[seen]], place_of[own[seen]] = len(keypoints), np.arange(seen.sum())
-            keypoints[flat.image_id, k] = xy[seen]
+            keypoints[flat.image.image_id, k] = xy[seen]
     shared = replace(points, images=image_of, keypoints=place_of)
     return shared.taken(shared.paired(place_of >= 0)), keypoints

@@ -17,7 +17,7 @@ from sfm_shapefit.files.colmap.binary_records import COUNT, IMAGE, NO_POINT, POI
 from sfm_shapefit.files.colmap.check import check_model_files
 from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS
-from sfm_shapefit.files.colmap.picture_colors import Pictures, color_model, colors_of_pictures
+from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model, colors_of_pictures
 from sfm_shapefit.files.colmap.point_colors import color_points
 from sfm_shapefit.files.colmap.points import Keypoints, add_points, points2d_xy
 from sfm_shapefit.files.colmap.template import Template
@@ -82,7 +82,7 @@ class SeededModel:
         own, ids = self.keypoints, self.images.ids.tolist()
         return lambda k: own[k].astype(np.float64) if len(own[k]) else points2d_xy(there[ids[k]])
 
-    def colored(self, pictures: Pictures) -> tuple[Self, tuple[str, ...]]:
+    def colored(self, pictures: PictureFolder) -> tuple[Self, tuple[str, ...]]:
         """Return the model whose points without a color have that of pictures, and unreadable ones' names."""
         if "reconstruction" in vars(self):  # whoever asked for it may have changed it
             model, unread = color_model(self.reconstruction, pictures)
