@@ -407,8 +407,8 @@ class CheckedFacts(FactsOfModel):
     def _next_of_evidence(self, path: str) -> NextStep:
         """Return how to get more evidence: from photographs, or from all pairs of them if asked."""
         if self.images:
-            text = "Next: make a database of all its photographs, from which `map` places all anew."
-            return NextStep(text, "colmap feature_extractor --database_path new.db --image_path IMAGES")
+            text = "Next: match all its photographs, and place them anew."
+            return NextStep(text, "sfm-shapefit map IMAGES mapped")
         text = "Next: check it against its photographs, or the database that it was made from (--database)."
         return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")
 
@@ -429,8 +429,7 @@ class CheckedFacts(FactsOfModel):
             command = f"sfm-shapefit locate {path} located --intrinsics all{self.inputs.database_flag}"
             return NextStep(text, command)
         text = "Next: give all images of a device one lens, and reconstruct them again."
-        one = "--ImageReader.single_camera 1"
-        return NextStep(text, f"colmap feature_extractor --database_path new.db --image_path IMAGES {one}")
+        return NextStep(text, "sfm-shapefit map IMAGES mapped")
 
     def told(self, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Telling:
         """Return what the terminal says, of cameras what is weak about them."""
