@@ -313,6 +313,6 @@ def test_images_without_a_pose_are_no_cameras_to_look_at():
 def test_lenses_that_cannot_be_ask_for_one_lens_per_device_and_a_single_one_for_its_calibration():
     facts = check(RING / "sparse/0", second_opinion=False).facts
     odd = ModelVerdict.weigh([Reason(kind=Kind.LENS, sentence="a lens is 42 widths long")])
-    for num_lenses, advice in ((8, "--ImageReader.single_camera 1"), (1, "--intrinsics all")):
+    for num_lenses, advice in ((8, "sfm-shapefit map IMAGES"), (1, "--intrinsics all")):
         step = replace(facts, verdict=odd, num_lenses=num_lenses).next_step
         assert advice in step.command

@@ -209,7 +209,7 @@ def test_the_ground_is_leveled_as_surely_as_it_says(tmp_path, seed):
     assert 0.05 < sigma_deg < 1.5
 
 
-def test_what_is_level_or_has_a_datum_keeps_its_axes(tmp_path):
+def test_what_is_level_keeps_its_axes_and_so_does_what_is_not_to_be_leveled(tmp_path):
     sky = draw_sky(tmp_path, ["pinhole"], np.eye(3), roll_deg=1.0, num_frames=8)
     made = sfm_shapefit.workspace(sky.model, sky.images, tmp_path / "out")
     assert made.level.startswith("z points up already, within ")
@@ -218,6 +218,30 @@ def test_what_is_level_or_has_a_datum_keeps_its_axes(tmp_path):
     assert kept.level == "its axes stay, as asked"
     for k, point in kept.reconstruction.points3D.items():
         np.testing.assert_array_equal(point.xyz, turned.model.point3D(k).xyz)
+
+
+def test_a_model_placed_on_earth_keeps_its_axes(tmp_path):
+    sky = draw_sky(tmp_path, ["pinhole"])
+    (tmp_path / "model").mkdir()
+    sky.model.write(tmp_path / "model")
+    datum = {"latitude_deg": 48.0, "longitude_deg": 11.0, "altitude_m": 500.0}
+    (tmp_path / "model/locate.json").write_text(json.dumps({"datum": datum}))
+    made = sfm_shapefit.workspace(tmp_path / "model", sky.images, tmp_path / "out")
+    assert made.level == "its axes are those of its priors: east, north, up"
+    for k, point in made.reconstruction.points3D.items():
+        np.testing.assert_array_equal(point.xyz, sky.model.point3D(k).xyz)
+
+
+def test_pictures_of_several_folders_are_one_folder_of_pictures_that_can_be_written(tmp_path):
+    sky = draw_sky(tmp_path, ["pinhole"], num_frames=3)
+    (sky.images / "a").mkdir()
+    for image_id, name in enumerate(("a/b.png", "a_b.png", "c.webp"), start=1):
+        (sky.images / sky.model.image(image_id).name).rename(sky.images / name)
+        sky.model.images[image_id].name = name
+    sfm_shapefit.workspace(sky.model, sky.images, tmp_path / "out", level="never")
+    written = {path.name for path in (tmp_path / "out/images").iterdir()}
+    assert written == {"a_b.png", "a_b_.png", "c.png"}
+    assert len(list(read_as_3dgs(tmp_path / "out"))) == 3
 
 
 def test_pictures_that_are_missing_or_broken_are_named_and_left_out(tmp_path):
