@@ -19,7 +19,7 @@ from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, angle_between_deg
 from sfm_shapefit.base.paths import refuse_no_folder
-from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.base.wording import counted, counted_are, first_of
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, model_of, read_model
 from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
@@ -104,7 +104,7 @@ def workspace(
         with clock("pictures"):
             (folder / "images").mkdir()
             flats, missing = flats_of(leveled, Path(images))
-            reasons = dict.fromkeys(missing, "has no picture")
+            reasons = dict.fromkeys(missing, "no picture")
             for done, why in enumerate(write_flats(flats, folder / "images", clock.threads)):
                 reasons |= {flats[done].name: why} if why else {}
                 clock.advance(done + 1, len(flats))
@@ -112,7 +112,8 @@ def workspace(
             if not flats:
                 name, why = next(iter(reasons.items()))
                 raise InputError(
-                    f"{images} has no picture of the model ({name} {why}): is it the right folder?"
+                    f"{images} has no picture of the model ({name}: {why}); give the folder of those that it "
+                    "was made of"
                 )
         with clock("model"):
             colored, _ = color_model(leveled, PictureFolder(Path(images), clock.threads))
@@ -127,7 +128,7 @@ def _warn(made: "pycolmap.Reconstruction", reasons: Mapping[str, str]) -> Iterat
     """Yield what is missing, a sentence each."""
     for why in dict.fromkeys(reasons.values()):
         names = [name for name, reason in reasons.items() if reason == why]
-        yield f"{counted(len(names), 'image')} left out, as each {why}: {first_of(names)}"
+        yield f"{counted_are(len(names), 'image')} left out ({why}): {first_of(names)}"
     if not made.num_points3D():
         yield "the model has no 3D points, so that splatting begins with random ones; `locate` makes some"
 

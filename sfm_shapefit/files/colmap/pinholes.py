@@ -213,9 +213,9 @@ def write_flats(flats: Sequence[Flat], folder: Path, threads: int) -> Iterator[s
 def _write_flat(flat: Flat, folder: Path, maps_of: Callable[[int, int], Maps]) -> str:
     camera, picture = flat.camera, read_picture(flat.file)
     if picture is None:
-        return "cannot be read"
+        return "unreadable picture"
     if picture.shape[:2] != (camera.height, camera.width):
-        return "is not as large as its camera says"
+        return "picture of another size than its camera's"
     edge = cv2.BORDER_WRAP if camera.is_spherical() else cv2.BORDER_REPLICATE
     for k, (pinhole, name) in enumerate(zip(flat.pinholes, flat.names, strict=True)):
         if pinhole.is_same and flat.file.suffix == Path(name).suffix:
