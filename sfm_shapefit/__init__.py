@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.match import match_images
     from sfm_shapefit.pipeline.place import place
     from sfm_shapefit.pipeline.relative_rotations import relative_rotations
+    from sfm_shapefit.pipeline.workspace import Workspace, workspace
     from sfm_shapefit.pipeline.write import WriteOptions, write_result
     from sfm_shapefit.placement.options import GaugeOptions
     from sfm_shapefit.placement.place import Placement
@@ -86,6 +87,7 @@ _HOMES = {
     "pipeline.map": ("map_database",),
     "pipeline.match": ("match_images",),
     "pipeline.relative_rotations": ("relative_rotations",),
+    "pipeline.workspace": ("Workspace", "workspace"),
     "pipeline.write": ("WriteOptions", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "facts.options": ("InspectOptions", "JoinOptions", "LocateOptions", "MapOptions", "SourceOptions"),
@@ -141,6 +143,7 @@ __all__ = [
     "TrustOptions",
     "UnsolvableError",
     "ViewGraph",
+    "Workspace",
     "WriteOptions",
     "average_database",
     "average_rotations",
@@ -160,6 +163,7 @@ __all__ = [
     "place",
     "relative_rotations",
     "solve",
+    "workspace",
     "write_result",
 ]
 

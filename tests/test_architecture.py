@@ -43,7 +43,7 @@ DOORS = {
     "cvxpy": {"solver/conic.py"},
     "pymetis": {"laplacian"},
     "distributed": {"pipeline/execution.py"},
-    "cv2": {"synthetic", "report/thumbnails.py"},
+    "cv2": {"synthetic", "report/thumbnails.py", "files/colmap/pinholes.py"},
     "trimesh": {"synthetic/surfaces.py", "report/mesh.py"},
     "pycolmap": {
         "files/",

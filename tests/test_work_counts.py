@@ -9,7 +9,7 @@ does less has been made cheaper: lower the number, so that it stays so.
 | solves | solves of the convex program with a certificate |
 | assessments | full judgements of a placement: verdicts of pairs, covariances and trust of cameras |
 | openings | connections to the user's database |
-| conversions | pycolmap.Reconstructions that are made, copied, read or written |
+| conversions | models that are read or written, and pycolmap.Reconstructions that are made or copied |
 
 Each is counted at the points of `POINTS`, the only table that changes where code moves.
 """
@@ -46,6 +46,8 @@ POINTS = {
         *("pycolmap:Reconstruction.__init__", "pycolmap:Reconstruction.__copy__"),
         *("pycolmap:Reconstruction.__deepcopy__", "pycolmap:Reconstruction.read"),
         *("pycolmap:Reconstruction.write", "pycolmap:Reconstruction.write_text"),
+        "sfm_shapefit.files.colmap.read_binary:read_files",
+        "sfm_shapefit.files.colmap.write_binary:write_binary",
     ),
 }
 """Functions and methods, each after its module; those of `pairs` yield batches that have `pairs`."""

@@ -128,7 +128,7 @@ class OutputFlags(Settings):
     overwrite: bool = option(False, "Replace an earlier output of sfm-shapefit, of any command.")
     report: bool = option(True, "Write report.html: one page that works offline.")
     images: str = option(
-        "", "Folder of the images, small pictures of which are in report.html; 4 MB at most."
+        "", "Folder of the images: points get their colors, report.html small pictures of them, 4 MB at most."
     )
     json: bool = option(False, "Print one JSON object on stdout and nothing else.")
     strict: bool = option(False, f"{STRICT_HELP}; OUT is written.")

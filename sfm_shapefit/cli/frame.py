@@ -13,7 +13,7 @@ import typer
 
 from sfm_shapefit.base.display import row
 from sfm_shapefit.base.settings import S, flat_values
-from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
     print_answer,
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     Result = LocateResult | MapResult | GraphResult | JoinedModel
 
+_BLACK = "the points have none; --images FOLDER gives them those of the images"
 _NOTICED_S = 1.0  # seconds; a user does not notice less compiling
 
 
@@ -57,11 +58,11 @@ class Run(Generic[S]):
 
         The command ends with exit code 4, if that was asked for and the model is not to be used.
         """
-        from sfm_shapefit.pipeline.write import write_result
+        from sfm_shapefit.pipeline.write import WriteOptions, deliver
 
         flags = self.flags
         how: dict[str, Any] = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
-        write_result(found, out, protect=self.protect, **how)
+        found = deliver(found, out, WriteOptions(protect=tuple(self.protect), **how))
         self.is_unusable = flags.strict and not found.verdict.is_usable
         if self.flags.json:
             self.shown = lambda: print_json(found.summary())
@@ -70,29 +71,25 @@ class Run(Generic[S]):
 
     def _tell(self, found: "Result", source: Path, out: Path) -> None:
         """Print the details if they are wanted, the answer, the verdict, and what to do next."""
+        from sfm_shapefit.pipeline.colors import has_colors
+
         told, pages = found.told, [str(out / folder / "report.html") for folder in found.told.folders]
         if self.flags.verbose:
             known = dict(found.timings_s)
             rest = time.perf_counter() - self.started - sum(known.values())
             stages = ", ".join(f"{stage} {s:.2f}" for stage, s in (known | {"start and write": rest}).items())
             print_table(str(source), [*told.details, row("seconds", stages)], told.elsewhere)
-        names = found.image_names
-        missing = self._missing_pictures(names)
-        lacks = (
-            f"{self.flags.images} lacks {missing} of {counted(len(names), 'image')}: is it the right folder?"
-        )
-        rows = [*told.rows, row("warning", lacks if missing else "")]
-        print_answer(told._replace(rows=rows), self._describe_time())
+        black = "" if self.flags.images or has_colors(found) else _BLACK
+        print_answer(told._replace(rows=[*told.rows, row("colors", black)]), self._describe_time())
         opened = f"; open {first_of([*map(shlex.quote, pages)])}" if self.flags.report else ""
-        images = self.flags.images if missing < len(names) else ""
+        images = self.flags.images if self._has_pictures(found.image_names) else ""
         step = _with_folders(told.step.command, out / told.folders[0], images or "IMAGES")
         print_ending(found.verdict.grade.value, found.verdict.statement, f"written to {out}/{opened}", step)
 
-    def _missing_pictures(self, names: Sequence[str]) -> int:
+    def _has_pictures(self, names: Sequence[str]) -> bool:
         from sfm_shapefit.base.paths import file_of
 
-        folder = Path(self.flags.images)
-        return sum(not file_of(folder, name) for name in names) if self.flags.images else 0
+        return any(file_of(Path(self.flags.images), name) for name in names)
 
     def _describe_time(self) -> str:
         total = f"{time.perf_counter() - self.started:.1f} s"

@@ -35,7 +35,7 @@ _FLAGS = (
     "map",
     cls=GroupedCommand,
     short_help="Make models from the matches of a COLMAP database.",
-    epilog="Examples: sfm-shapefit map images out; sfm-shapefit map database.db out --images images",
+    epilog="Example: sfm-shapefit map images out",
 )
 @takes(flags_of(MapOptions, *_FLAGS), flags_of(MatchingOptions), flags_of(OutputFlags), settings=MapOptions)
 def map_command(
@@ -93,5 +93,5 @@ def _match(images: Path, database: Path, given: dict[str, Any], run: Run[MapOpti
 
     matching = read_options(MatchingOptions, given)
     threads = run.options.placement.solver.threads
-    match_images(images, database, matching, threads=threads, progress=run.progress)
+    match_images(images, database, options=matching, threads=threads, progress=run.progress)
     run.flags = replace(run.flags, images=run.flags.images or str(images))

@@ -24,7 +24,7 @@ from sfm_shapefit.cli.console import (
 _GROUPS = {
     "Make models": ("map", "locate", "join", "place"),
     "Look at models and results": ("check", "inspect", "evaluate"),
-    "Convert, and make test scenes": ("convert", "synth"),
+    "Convert, and make test scenes": ("workspace", "convert", "synth"),
     "Set up": ("warm-up",),
 }
 """The commands in the help, the most used first."""

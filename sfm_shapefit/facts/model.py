@@ -212,7 +212,6 @@ class FactsOfModel(Facts):
         float | None, "Mean reprojection error of these points; null if there are none."
     ]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
-    has_panoramas: Annotated[bool, "Whether some images are EQUIRECTANGULAR: COLMAP undistorts none."] = False
     evidence: Annotated[ToldEvidence, "What speaks against the model although it fits."] = ToldEvidence()
 
     def told_lines(self, against: tuple[int, int], more: str = "") -> list[str]:
@@ -354,13 +353,8 @@ def next_of_model(grade: Grade, facts: FactsOfModel) -> NextStep:
         step = f"sfm-shapefit inspect {model}{inputs.database_flag}"
         return NextStep("Next: find out what is wrong with the input.", step)
     looked = ", once you have looked" if grade is Grade.LOOK else ""
-    if facts.has_panoramas:
-        step = "sfm-shapefit convert {out} transforms.json"
-        return NextStep(f"Next: give the panoramas to nerfstudio or LichtFeld{looked}.", step)
-    return NextStep(
-        f"Next: undistort the images for splatting or dense reconstruction{looked}.",
-        "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out_dense}",
-    )
+    text = f"Next: undistort the images for splatting or dense reconstruction{looked}."
+    return NextStep(text, "sfm-shapefit workspace {out} IMAGES {out_dense}")
 
 
 def _from_here(path: str) -> str:
@@ -384,7 +378,7 @@ class CheckedFacts(FactsOfModel):
         """What to do next, with the folder of the pictures where it is known."""
         step = self._next()
         images = shlex.quote(_from_here(self.images)) if self.images else "IMAGES"
-        return step._replace(command=step.command.replace("_path IMAGES", f"_path {images}"))
+        return step._replace(command=step.command.replace(" IMAGES", f" {images}"))
 
     def _next(self) -> NextStep:
         """Return what to do next, by the verdict and by what was asked."""
@@ -413,8 +407,8 @@ class CheckedFacts(FactsOfModel):
     def _next_of_evidence(self, path: str) -> NextStep:
         """Return how to get more evidence: from photographs, or from all pairs of them if asked."""
         if self.images:
-            text = "Next: make a database of all its photographs, from which `map` places all anew."
-            return NextStep(text, "colmap feature_extractor --database_path new.db --image_path IMAGES")
+            text = "Next: match all its photographs, and place them anew."
+            return NextStep(text, "sfm-shapefit map IMAGES mapped")
         text = "Next: check it against its photographs, or the database that it was made from (--database)."
         return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")
 
@@ -435,8 +429,7 @@ class CheckedFacts(FactsOfModel):
             command = f"sfm-shapefit locate {path} located --intrinsics all{self.inputs.database_flag}"
             return NextStep(text, command)
         text = "Next: give all images of a device one lens, and reconstruct them again."
-        one = "--ImageReader.single_camera 1"
-        return NextStep(text, f"colmap feature_extractor --database_path new.db --image_path IMAGES {one}")
+        return NextStep(text, "sfm-shapefit map IMAGES mapped")
 
     def told(self, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Telling:
         """Return what the terminal says, of cameras what is weak about them."""

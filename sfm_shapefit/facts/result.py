@@ -92,6 +92,9 @@ class ModelInArrays(Protocol):
     def as_it_is(self) -> Any:
         """The reconstruction, which may have been changed, if it is made; else the model itself."""
 
+    def colored(self, pictures: Any) -> tuple["ModelInArrays", tuple[str, ...]]:
+        """Return the model with colors of pictures, and the names of those that cannot be read."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inputs:
@@ -271,7 +274,6 @@ class LocateResult(_Placed):
             ),
             num_points=model.num_points3D(),
             mean_reprojection_error_px=model.compute_mean_reprojection_error(),
-            has_panoramas=any(lens.is_panorama for lens in self.placed.lenses),
             num_points_as_nodes=int(np.sum(placement.nodes >= placement.num_cameras)),
             scale=gauge.statement,
             scale_sigma=gauge.scale_sigma,

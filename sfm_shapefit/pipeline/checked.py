@@ -311,7 +311,6 @@ def _tell(
         "figures": KeyFigures.of_cameras(cameras, error_deg, *measures),
         "sigma_of": "",
         "scale": "input: those of the model",
-        "has_panoramas": any(lens.is_panorama for lens in model.images.lenses),
         "pieces": [],
         "loose_groups": [],
         "versions": {"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},

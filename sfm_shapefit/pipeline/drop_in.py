@@ -14,7 +14,7 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.map import map_database, measure_run
 from sfm_shapefit.pipeline.mapping import start_run
-from sfm_shapefit.pipeline.write import write_result
+from sfm_shapefit.pipeline.write import WriteOptions, deliver
 from sfm_shapefit.scene.points import number_points
 
 if TYPE_CHECKING:
@@ -36,7 +36,8 @@ def global_mapping(
 
     Args:
         database_path: the COLMAP database with verified matches; it is never changed.
-        image_path: folder of the images, of which the report has small pictures; "" for none.
+        image_path: folder of the images, which give points their colors and the report small pictures; ""
+            for none.
         output_path: folder for the models 0, 1, ..., each with its report.html; empty, new, or an earlier
             output, which is replaced.
         options: `MapOptions`, or a mapping of some of them; defaults if None. From pycolmap's options
@@ -55,7 +56,7 @@ def global_mapping(
     elif options is not None and not isinstance(options, MapOptions):
         options = _options_of(options)
     mapped = map_database(database_path, options)
-    write_result(mapped, output_path, overwrite=True, images=image_path)
+    mapped = deliver(mapped, output_path, WriteOptions(overwrite=True, images=image_path))
     return {number: model.reconstruction for number, model in enumerate(mapped.models)}
 
 

@@ -27,8 +27,8 @@ next in a sequence are matched too, what closes its loops."""
 def match_images(
     images: Path | str,
     database: Path | str,
-    options: MatchingOptions | None = None,
     *,
+    options: MatchingOptions | None = None,
     threads: int = 0,
     progress: Progress | None = None,
     **overrides: Any,

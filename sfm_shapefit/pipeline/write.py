@@ -26,6 +26,7 @@ from sfm_shapefit.facts.rows import covariance_of, covariances_text, own_camera_
 from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
 from sfm_shapefit.files.colmap.seed import write_model
 from sfm_shapefit.files.options import MADE_FIRST
+from sfm_shapefit.pipeline.colors import Result, with_colors
 
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
@@ -50,7 +51,9 @@ class WriteOptions(Settings):
         (), "Paths that the folder must not be or contain, beside the inputs of the result."
     )
     report: bool = option(True, "Write report.html, one page that explains the result and works offline.")
-    images: Path | str = option("", "Folder of the images, of which report.html is to have small pictures.")
+    images: Path | str = option(
+        "", "Folder of the images: points get their colors, and report.html has small pictures of them."
+    )
 
 
 def write_result(
@@ -71,7 +74,12 @@ def write_result(
     Raises:
         InputError: if the folder exists, cannot be written, or would hit a protected path.
     """
-    options = merge_options(options, WriteOptions, overrides)
+    deliver(found, out, merge_options(options, WriteOptions, overrides))
+
+
+def deliver(found: Result, out: Path | str, options: WriteOptions) -> Result:
+    """Write a result as `write_result` does, and return it with the colors that its points have there."""
+    found = with_colors(found, options.images) if str(options.images) else found
     protect = [*_inputs_of(found), *options.protect]
     made = isinstance(found, MapResult) and found.images is not None
     kept = MADE_FIRST if made else ()
@@ -84,6 +92,7 @@ def write_result(
             write_json(found.summary(), folder / MAP_MARKER)
         else:
             _write_files(found, folder, options)
+    return found
 
 
 def _inputs_of(found: Any) -> list[Path]:

@@ -37,20 +37,23 @@ def ply_bytes(
     comment: str = "",
     *,
     fine: bool = False,
+    with_normals: bool = False,
 ) -> bytes:
     """Return vertices (n, 3), colors (n, 3) and faces (f, 3) as a binary PLY, in double if need be or `fine`.
 
-    Need is where float32 would move vertices by a millionth of their spread.
+    Need is where float32 would move vertices by a millionth of their spread. 3DGS reads no points without
+    normals, and looks at none: they are 0.
     """
     largest = np.abs(vertices).max(initial=0.0)
     if len(vertices):
         fine |= bool(largest * _FLOAT32 > _FINE_ENOUGH * median_spread(vertices))
         fine |= bool(largest > np.finfo(np.float32).max)
     kind, name = ("<f8", "double") if fine else ("<f4", "float")
-    rows = np.empty(len(vertices), [("xyz", kind, 3), ("rgb", "u1", 3)])
+    axes = ["x", "y", "z", *(["nx", "ny", "nz"] if with_normals else [])]
+    rows = np.zeros(len(vertices), [("xyz", kind, 3), ("n", kind, len(axes) - 3), ("rgb", "u1", 3)])
     rows["xyz"], rows["rgb"] = vertices, colors
     lines = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] if comment else [])]
-    lines += [f"element vertex {len(rows)}", *(f"property {name} {axis}" for axis in "xyz")]
+    lines += [f"element vertex {len(rows)}", *(f"property {name} {axis}" for axis in axes)]
     lines += [f"property uchar {color}" for color in ("red", "green", "blue")]
     parts = [rows.tobytes()]
     if faces is not None:

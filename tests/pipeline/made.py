@@ -95,7 +95,7 @@ def delivered(source) -> ModelState:
         placement=judge(state.placement, PlacementOptions()),
         kept=~nobody,
         images=model.images,
-        points=points_of(model.reconstruction, model.images),
+        points=points_of(model.arrays, model.images),
         support=Support(np.full(8, -1), nobody, ObservationShares(1.0, 0.0)),
         gauge=state.frame,
         evidence=ModelEvidence(),

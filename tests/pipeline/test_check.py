@@ -48,7 +48,7 @@ def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path, ring_ma
     drawing, facts = found.drawing, found.facts
     assert facts.verdict.statement == "good"
     assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
-    assert "image_undistorter" in banner(drawing, facts)["command"]
+    assert " workspace " in banner(drawing, facts)["command"]
 
     moved, name = with_one_displaced(tmp_path / "moved")
     found = check(moved, RING / "database.db", second_opinion=ring_mapped)
@@ -120,11 +120,11 @@ def test_what_map_doubts_check_does_not_call_good():
             "at least half as much speaks for another place or rotation"
             in found.facts.evidence.second.statement
         )
-        assert "image_undistorter" in found.facts.next_step.command  # it would be placed there again
+        assert " workspace " in found.facts.next_step.command  # it would be placed there again
         assert banner(found.drawing, found.facts)["sentence"].startswith("0004.jpg, 0005.jpg may be wrong")
         evidence = found.facts.evidence
         unlike = replace(evidence, second=replace(evidence.second, has_nothing_in_common=True))
-        assert "image_undistorter" not in replace(found.facts, evidence=unlike).next_step.command
+        assert " workspace " not in replace(found.facts, evidence=unlike).next_step.command
 
 
 def test_a_weak_camera_that_stands_where_another_model_has_it_is_not_named(monkeypatch):
@@ -276,7 +276,7 @@ def test_the_second_opinion_is_kept_where_asked_and_is_the_next_step(tmp_path):
     (model, name), out = with_one_displaced(tmp_path / "model"), tmp_path / "mapped"
     database, keep = ("--database", RING / "database.db"), ("--second-opinion", out)
     told = run("check", model, *database, *keep, code=0).stdout
-    assert f"--input_path {out}/0 " in told
+    assert f" workspace {out}/0 " in told
     assert pycolmap.Reconstruction(out / "0").num_reg_images() == 8
     assert (out / "map.json").is_file()
     assert "exists already" in run_refused("check", model, *database, *keep)
@@ -313,6 +313,6 @@ def test_images_without_a_pose_are_no_cameras_to_look_at():
 def test_lenses_that_cannot_be_ask_for_one_lens_per_device_and_a_single_one_for_its_calibration():
     facts = check(RING / "sparse/0", second_opinion=False).facts
     odd = ModelVerdict.weigh([Reason(kind=Kind.LENS, sentence="a lens is 42 widths long")])
-    for num_lenses, advice in ((8, "--ImageReader.single_camera 1"), (1, "--intrinsics all")):
+    for num_lenses, advice in ((8, "sfm-shapefit map IMAGES"), (1, "--intrinsics all")):
         step = replace(facts, verdict=odd, num_lenses=num_lenses).next_step
         assert advice in step.command

@@ -104,7 +104,7 @@ def test_several_models_get_one_table_and_what_contradicts_is_said(tmp_path):
     said = run("check", folder, "--no-second-opinion", code=0).stdout
     assert f"keep: {folder / '0'}" in said
     assert "cannot be read" in said
-    assert f"--input_path {folder / '0'}" in said.splitlines()[-1]
+    assert f" workspace {folder / '0'} " in said.splitlines()[-1]
 
 
 def test_where_no_model_can_be_used_nothing_is_to_be_kept(tmp_path):

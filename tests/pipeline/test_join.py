@@ -84,7 +84,7 @@ def test_models_are_joined_in_the_world_of_the_first(tmp_path, adjust):
     assert told["agreeing_pairs"] >= 3
     assert (told["solve"]["status"], told["solve"]["gap"] <= 1e-8) == ("converged", True)
     assert (told["folder"], facts["models"]) == (".", [*map(str, models)])
-    assert f"--input_path {out} --output_path {out}_dense" in " ".join(shown.split())
+    assert f"workspace {out} IMAGES {out}_dense" in " ".join(shown.split())
     assert told["similarity"]["scale"] == pytest.approx(2.5, rel=1e-4)
     assert 0.0 < told["scale_sigma"] < 0.01
     assert errors_of(out) == (8, pytest.approx(0.0, abs=1e-4))

@@ -524,9 +524,7 @@ def check_joined_folder(folder, found):
     assert len(drawing.pairs.classes) > sum(len(model.located.pairs) for model in found.models)
     assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
     assert (folder / "report.html").is_file()
-    assert banner(drawing, facts)["command"].startswith(
-        "colmap image_undistorter "
-    )  # its models are adjusted
+    assert banner(drawing, facts)["command"].startswith("sfm-shapefit workspace ")  # its models are adjusted
 
 
 def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path):

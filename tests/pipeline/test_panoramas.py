@@ -61,5 +61,3 @@ def test_nothing_is_said_of_a_focal_length_of_panoramas(tmp_path):
     write_scene(tmp_path, [camera_of_model("EQUIRECTANGULAR"), camera_of_model("PINHOLE", 2)], num_frames=8)
     found = sfm_shapefit.map_database(tmp_path / "database.db", intrinsics="all").models[0].located
     assert [row.camera for row in found.facts.intrinsics] == [2]
-    assert found.facts.has_panoramas
-    assert "image_undistorter" not in found.facts.next_step.command

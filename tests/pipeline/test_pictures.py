@@ -42,7 +42,7 @@ def test_poses_alone_are_good_by_their_pictures_and_nothing_is_written(drawn):
     assert "verdict: good" in result.output
     assert "8 of 8 pictures in" in result.output
     assert "neighbors" in result.output
-    assert f"--image_path {drawn / 'images'}" in result.output  # the next step knows the folder
+    assert f"map {drawn / 'images'} mapped" in result.output  # the next step knows the folder
     assert fingerprint(drawn) == before
 
 

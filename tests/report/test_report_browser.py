@@ -108,7 +108,7 @@ def test_the_report_opens_without_errors_and_without_the_network(driver, report)
     )
     assert drawn == ["trust", "histogram", "tracks", "reprojection", "matrix", "support", "convergence"]
     assert driver.execute_script(COLORS)["count"] > 50
-    assert "image_undistorter" in driver.find_element("id", "command").text
+    assert "workspace" in driver.find_element("id", "command").text
     assert str(report.parent) in driver.find_element("id", "command").text
 
 

@@ -250,9 +250,9 @@ def test_a_warning_leads_to_its_camera_and_is_not_said_of_one_that_is_listed_any
 @pytest.mark.parametrize(
     ("grade", "adjusted", "headline", "command"),
     [
-        ("good", None, "Good: this model can be used", "image_undistorter"),
-        ("good", ADJUSTED, "Good: this model can be used", "image_undistorter"),
-        ("look", None, "Look at 2 cameras first", "image_undistorter"),
+        ("good", None, "Good: this model can be used", "workspace"),
+        ("good", ADJUSTED, "Good: this model can be used", "workspace"),
+        ("look", None, "Look at 2 cameras first", "workspace"),
         (
             "do not use",
             None,

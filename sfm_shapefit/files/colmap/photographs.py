@@ -53,7 +53,7 @@ def find_photographs(folder: Path) -> list[str]:
         found = "no image" if not names else f"only {names[0]}"
         unread = f" and {first_of([f'{n} {suffix}' for suffix, n in others.items()])}" if others else ""
         advice = "; convert these to .jpg first" if others else "; give a folder of two images or more"
-        raise InputError(f"{folder} holds {found}{unread}{advice}")
+        raise InputError(f"{folder} is a folder without a database.db that holds {found}{unread}{advice}")
     return sorted(names)
 
 

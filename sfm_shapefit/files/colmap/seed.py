@@ -15,6 +15,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.binary_records import NO_POINT, POINT2D, POINT3D
 from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model_arrays import AT_ONCE, ModelArrays, Records
+from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model, colors_of_pictures
 from sfm_shapefit.files.colmap.point_colors import color_points
 from sfm_shapefit.files.colmap.points import Keypoints
 from sfm_shapefit.files.colmap.read_binary import read_folder
@@ -69,16 +70,35 @@ class SeededModel:
         """
         keypoints = keypoints or (lambda _: None)
         own = tuple(_narrowed(keypoints(k)) for k in range(images.num_images))
-        rows, ids = template.model.images.rows(images.ids).tolist(), images.ids.tolist()
+        colors, bare = np.zeros((points.num_points, 3), dtype=np.uint8), replace(template, colors=None)
+        seed = cls(template=bare, images=images, points=points, colors=colors, keypoints=own)
+        return replace(seed, colors=color_points(points, images.ids.tolist(), seed._pixels, template.colors))
 
-        def pixels(image: int) -> FloatArray:
-            if len(own[image]):
-                return own[image].astype(np.float64)
-            return np.ascontiguousarray(template.model.keypoints(rows[image])["xy"])
+    @cached_property
+    def _pixels(self) -> Callable[[int], FloatArray]:
+        """What returns the points2D (k, 2) of an image by its row."""
+        model, own = self.template.model, self.keypoints
+        rows = model.images.rows(self.images.ids).tolist()
 
-        colors = color_points(points, ids, pixels, template.colors)
-        bare = replace(template, colors=None)
-        return cls(template=bare, images=images, points=points, colors=colors, keypoints=own)
+        def pixels(k: int) -> FloatArray:
+            return (
+                own[k].astype(np.float64)
+                if len(own[k])
+                else np.ascontiguousarray(model.keypoints(rows[k])["xy"])
+            )
+
+        return pixels
+
+    def colored(self, pictures: PictureFolder) -> tuple[Self, tuple[str, ...]]:
+        """Return the model whose points without a color have that of pictures, and unreadable ones' names."""
+        if "reconstruction" in vars(self):  # whoever asked for it may have changed it
+            model, unread = color_model(self.reconstruction, pictures)
+            fresh = replace(self)
+            vars(fresh)["reconstruction"] = model
+            return fresh, unread
+        known = self.points, self.images, self._pixels, self.colors
+        colors, unread = colors_of_pictures(*known, pictures)
+        return replace(self, colors=colors), unread
 
     def num_reg_images(self) -> int:
         """Return how many images have a pose; this and the next two are as of a reconstruction."""

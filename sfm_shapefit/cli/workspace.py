@@ -1,0 +1,64 @@
+"""`sfm-shapefit workspace MODEL IMAGES OUT`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sfm_shapefit.cli.console import print_lines, report_errors, show_progress
+from sfm_shapefit.cli.flags import (
+    GroupedCommand,
+    InputPath,
+    ModelArgument,
+    OutArgument,
+    OutputPath,
+    Quiet,
+    one_path,
+)
+from sfm_shapefit.cli.root import app
+
+
+@app.command(
+    "workspace",
+    cls=GroupedCommand,
+    short_help="Write images and model without distortion, for splatting and dense programs.",
+    epilog="Example: sfm-shapefit workspace mapped/0 images dense",
+)
+def workspace_command(
+    model: ModelArgument = None,
+    images: Annotated[
+        Path | None, typer.Argument(metavar="IMAGES", help="Folder of the images; they stay as they are.")
+    ] = None,
+    out: OutArgument = None,
+    *,
+    input_path: InputPath = None,
+    image_path: Annotated[Path | None, typer.Option("--image_path", hidden=True)] = None,
+    output_path: OutputPath = None,
+    level: Annotated[
+        str,
+        typer.Option(
+            "--level",
+            metavar="auto|never",
+            help="Whether the world is turned so that z points up, by horizontal axes of images and the "
+            "plane of the ground: auto, unless priors or gravity did; never.",
+        ),
+    ] = "auto",
+    quiet: Quiet = False,
+) -> None:
+    """Write images and MODEL without distortion to OUT, as splatting and dense programs read them.
+
+    3DGS, gsplat, brush, LichtFeld, nerfstudio, OpenMVS and COLMAP's dense commands take OUT as it is.
+    Panoramas and wide fisheyes are cut to faces.
+    """
+    source = one_path(model, input_path, "MODEL")
+    folder = one_path(images, image_path, "IMAGES")
+    target = one_path(out, output_path, "OUT")
+    with report_errors(target):
+        from sfm_shapefit.pipeline.workspace import LEVELS, workspace
+
+        if level not in LEVELS:
+            raise typer.BadParameter(f"--level must be one of {', '.join(LEVELS)}, got {level!r}")
+        with show_progress(not quiet) as progress:
+            made = workspace(source, folder, target, level=level, progress=progress)
+        if not quiet:
+            print_lines(made.told)
