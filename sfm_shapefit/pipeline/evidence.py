@@ -66,7 +66,7 @@ def gather_evidence(
     odd = (*find_odd_lenses(images, points, pictures, bogus), *find_flights(images))
     if fits is None:
         return ModelEvidence(lenses=lenses, oddities=odd)
-    if _has_keypoints(source.view, structure):
+    if source.has_database and _has_keypoints(source.view, structure):
         odd = (*odd, *find_split_duplicates(images, points, pictures, fits.directions, source.view))
     tied, untied = _tie(source, fits, structure)
     cuts, seams = find_cuts(*fits.sides, tied), tuple[Seam, ...]()

@@ -241,13 +241,14 @@ def merge_groups(
     pieces: Sequence[ModelPiece], tied: TiedPieces, joins: Sequence[Joined]
 ) -> list[JoinedGroup]:
     """Return the pieces that were joined, each group in the world of its first."""
-    growing = {number: _Growing(piece, number) for number, piece in enumerate(pieces)}
+    growing: dict[int, _Growing] = {}
     root = list(range(len(pieces)))
     for done in joins:
         if done.join is not None:
-            root[done.model] = root[done.to]
-            growing[root[done.to]].add(done, pieces[done.model], tied)
-    return [one.group for one in growing.values() if len(one.group.world_from) > 1]
+            first = root[done.model] = root[done.to]
+            group = growing[first] = growing.get(first) or _Growing(pieces[first], first)
+            group.add(done, pieces[done.model], tied)
+    return [growing[number].group for number in sorted(growing)]
 
 
 class _Growing:
@@ -324,7 +325,7 @@ def join_mapped(
     pieces = [
         ModelPiece(
             label=f"model {number}",
-            model=read_model(one.reconstruction),
+            model=read_model(one.model.arrays()),
             scale_sigma=(one.gauge.scale_sigma or 0.0) if one.images.has_rigs else None,
         )
         for number, one in located.items()
