@@ -57,6 +57,7 @@ from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.consensus import put_by_consensus
+from sfm_shapefit.refinement.length_prior import LengthPrior
 from sfm_shapefit.solver.program import adjoint, differences
 
 _LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
@@ -72,8 +73,6 @@ _SPREADS = (
 _PSEUDO_WRONG = 1.0  # pairs added to the wrong ones; their share may not become 0
 _FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
-_TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
-_SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
 _LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; e^4, twice the largest spread of lengths
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
@@ -177,6 +176,7 @@ class _Noise(NamedTuple):
     floor: float  # radians; lower levels count as this one
     variances: FloatArray  # (m, d - 1) rad^2, residuals by the locations
     precision: float  # 1 / variance of a log length in the prior
+    unit: float  # the same if cameras differ independently
 
 
 class _System(NamedTuple):
@@ -207,6 +207,7 @@ class Mixture:
         self._factor = allocate_factor(plan, d)
         self._least_gain = max(_LEAST_GAIN, _LEAST_GAIN_A_CAMERA * graph.num_nodes)
         self._descents: list[_Descent] = []
+        self._lengths = LengthPrior(graph)
 
     def descend(self, start: FloatArray) -> MixtureEnd | None:
         """Return where a descent from (n, d) locations ends; None if its equations are singular.
@@ -245,7 +246,7 @@ class Mixture:
         for _ in range(_WEIGH_ROUNDS):
             expected = at.errors**2 + variances
             levels = levels._replace(right=_right_share(self._expect(expected, levels, 0.0).sums))
-            noise = _Noise(levels, 0.0, variances, self._precision(at.lengths))
+            noise = _Noise(levels, 0.0, variances, *self._precisions(at.lengths))
             system = self._equations(at, noise.precision, self._expect(expected, levels, 0.0))
             if not self._refactor(system, _DAMPING[1]):
                 return -np.inf
@@ -263,7 +264,7 @@ class Mixture:
             for other in others:
                 if self._meet(other, step, at, max(floor, levels.typical)):
                     return other
-            noise = _Noise(levels, floor, variances, self._precision(at.lengths))
+            noise = _Noise(levels, floor, variances, *self._precisions(at.lengths))
             system = self._equations(at, noise.precision, found)
             path.append(at.locations)
             moved, damping = self._step(at, noise, system, damping)
@@ -389,10 +390,9 @@ class Mixture:
         change = float(self._expect((1.0 + _PROBE) * expected, levels, 0.0).information.sum()) - total
         return float(np.clip(1.0 + 2.0 / expected.shape[1] * change / _PROBE / total, _LEAST_TOLD, 1.0))
 
-    def _precision(self, lengths: FloatArray) -> float:
-        logs = np.log(lengths)
-        tau = np.clip(_SPREAD * np.mean(np.abs(logs - np.median(logs))), *_TAUS)
-        return float(self._graph.num_nodes / len(logs) / tau**2)
+    def _precisions(self, lengths: FloatArray) -> tuple[float, float]:
+        unit = self._graph.num_nodes / len(lengths) / self._lengths.variance(lengths)
+        return unit / self._lengths.design_effect(lengths), unit
 
     def _cost(self, at: _Residuals, noise: _Noise) -> float:
         likelihood = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor).likelihood
@@ -420,10 +420,10 @@ class Mixture:
         return True
 
     def _log_determinant(self, system: _System, noise: _Noise) -> float:
-        """Return log det(S) / 2 of the present factor, in units of the prior's precision."""
+        """Return log det(S) / 2 of the present factor, in units of the prior's precision without design effect."""
         n, d = self._graph.num_nodes, self._graph.dimension
         ground = 2.0 * float(np.trace(system.blocks, axis1=1, axis2=2).sum()) / (d * n)  # as `refactor` adds
-        free = d * np.log(ground) + (d * (n - 1) - 1) * np.log(noise.precision)
+        free = d * np.log(ground) + (d * (n - 1) - 1) * np.log(noise.unit)
         return 0.5 * float(free - self._factor.log_determinant())
 
     def _propagate(self, at: _Residuals) -> FloatArray:
