@@ -57,11 +57,13 @@ from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.consensus import put_by_consensus
+from sfm_shapefit.refinement.length_prior import LengthPrior
 from sfm_shapefit.solver.program import adjoint, differences
 
 _LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
 _NODES = np.linspace(-4.0, 4.0, 13)  # standard scores of log levels; finer sums of their density say the same
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
+_MOST_OPENED_RAD = 0.25  # radians
 _NEXT_FLOOR = 2.0  # typical levels; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
@@ -72,8 +74,6 @@ _SPREADS = (
 _PSEUDO_WRONG = 1.0  # pairs added to the wrong ones; their share may not become 0
 _FIT_ROUNDS = 4  # rounds of the shares in a step; the next step goes on with them
 _SETTLED = 1e-4  # change of a share; a smaller one is none
-_TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
-_SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
 _LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; e^4, twice the largest spread of lengths
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
@@ -175,8 +175,10 @@ class _Noise(NamedTuple):
 
     levels: Levels
     floor: float  # radians; lower levels count as this one
+    own: FloatArray  # (m, d - 1) rad^2, of the errors beside their levels
     variances: FloatArray  # (m, d - 1) rad^2, residuals by the locations
     precision: float  # 1 / variance of a log length in the prior
+    unit: float  # the same if cameras differ independently
 
 
 class _System(NamedTuple):
@@ -207,26 +209,28 @@ class Mixture:
         self._factor = allocate_factor(plan, d)
         self._least_gain = max(_LEAST_GAIN, _LEAST_GAIN_A_CAMERA * graph.num_nodes)
         self._descents: list[_Descent] = []
+        self._lengths = LengthPrior(graph)
 
     def descend(self, start: FloatArray) -> MixtureEnd | None:
         """Return where a descent from (n, d) locations ends; None if its equations are singular.
 
         That is the end of an earlier descent, the very same object, where it meets the path of that.
         """
-        descent = self._descend(start, _FIRST_FLOOR_RAD, _FIRST_LEVELS, self._descents)
+        closed = np.zeros_like(self._own)
+        descent = self._descend(start, _FIRST_FLOOR_RAD, _FIRST_LEVELS, closed, self._descents)
         if descent is None:
             return None
         self._descents.append(descent)
         return descent.end
 
     def improve(self, end: MixtureEnd) -> MixtureEnd:
-        """Return the end of most evidence that consensus and descents, in turn, lead to."""
+        """Return the end of most evidence that consensus, opened pairs and descents, in turn, lead to."""
         for _ in range(_MOST_ROUNDS):
-            moved = self._put_by_consensus(end)
-            if np.array_equal(moved, end.locations):
+            moved, opened = self._put_by_consensus(end), self._open(end)
+            if np.array_equal(moved, end.locations) and not opened.any():
                 break
             floor, before = min(_NEXT_FLOOR * end.levels.typical, _FIRST_FLOOR_RAD), _Descent([], end)
-            found = self._descend(moved, floor, end.levels, [before])
+            found = self._descend(moved, floor, end.levels, opened, [before])
             if found is None or found.end.bound <= end.bound + _ROUND_GAIN:
                 break
             end = found.end
@@ -245,7 +249,7 @@ class Mixture:
         for _ in range(_WEIGH_ROUNDS):
             expected = at.errors**2 + variances
             levels = levels._replace(right=_right_share(self._expect(expected, levels, 0.0).sums))
-            noise = _Noise(levels, 0.0, variances, self._precision(at.lengths))
+            noise = _Noise(levels, 0.0, self._own, variances, *self._precisions(at.lengths))
             system = self._equations(at, noise.precision, self._expect(expected, levels, 0.0))
             if not self._refactor(system, _DAMPING[1]):
                 return -np.inf
@@ -253,17 +257,22 @@ class Mixture:
         return bound
 
     def _descend(
-        self, start: FloatArray, floor: float, levels: Levels, others: list[_Descent]
+        self, start: FloatArray, floor: float, levels: Levels, opened: FloatArray, others: list[_Descent]
     ) -> _Descent | None:
-        """Return a descent from (n, d) locations, or the other that it meets."""
+        """Return a descent from (n, d) locations, or the other that it meets.
+
+        Errors have variances `opened`, (m, d - 1), beside their own, which fall as the floor does.
+        """
         at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
         variances, path = np.zeros_like(self._own), list[FloatArray]()
         for step in range(_MOST_STEPS):
-            levels, found = self._fit(at.errors**2 + variances, levels, floor)
+            own = self._own + opened
+            levels, found = self._fit(at.errors**2 + variances, levels, floor, own)
+            opening = float(np.sqrt(opened.max()))
             for other in others:
-                if self._meet(other, step, at, max(floor, levels.typical)):
+                if opening <= _NOISELESS_RAD and self._meet(other, step, at, max(floor, levels.typical)):
                     return other
-            noise = _Noise(levels, floor, variances, self._precision(at.lengths))
+            noise = _Noise(levels, floor, own, variances, *self._precisions(at.lengths))
             system = self._equations(at, noise.precision, found)
             path.append(at.locations)
             moved, damping = self._step(at, noise, system, damping)
@@ -271,10 +280,10 @@ class Mixture:
                 break
             before, bound = bound, self._log_determinant(system, noise) - system.cost
             last = at, noise, bound
-            if floor <= _NOISELESS_RAD and abs(bound - before) < self._least_gain:
+            if max(floor, opening) <= _NOISELESS_RAD and abs(bound - before) < self._least_gain:
                 break
             variances = self._propagate(at)
-            at, floor = moved, max(floor * _FALL, _LEVELS_RAD[0])
+            at, floor, opened = moved, max(floor * _FALL, _LEVELS_RAD[0]), opened * _FALL**2
         return None if last is None else _Descent(path, self._judge(*last))
 
     def _meet(self, other: _Descent, step: int, at: _Residuals, level: float) -> bool:
@@ -348,12 +357,14 @@ class Mixture:
         _expect(expected, self._own if own is None else own, levels2, weights, found)
         return found
 
-    def _fit(self, expected: FloatArray, levels: Levels, floor: float) -> tuple[Levels, _Expectation]:
+    def _fit(
+        self, expected: FloatArray, levels: Levels, floor: float, own: FloatArray
+    ) -> tuple[Levels, _Expectation]:
         """Return the levels after rounds of expectation maximization, and what is expected under them."""
-        found = self._expect(expected, levels, floor)
+        found = self._expect(expected, levels, floor, own)
         for _ in range(_FIT_ROUNDS):
             last, levels = levels, _maximize(found, expected, levels, floor)
-            found = self._expect(expected, levels, floor)
+            found = self._expect(expected, levels, floor, own)
             if np.abs(np.subtract(levels, last)).max() <= _SETTLED:
                 break
         return levels, found
@@ -367,9 +378,8 @@ class Mixture:
         usual = np.exp(2.0 * levels.mean) + self._own
         told = self._told_share(expected, levels, information)
         variances = (right + _UNKNOWN) / (information + _UNKNOWN / usual).mean(axis=1) / told
-        left = 1.0 - np.minimum(information * noise.variances, _MOST_LEVERAGE)
-        alone = np.minimum(noise.variances / left, _LARGEST_VARIANCE)
-        likelihood = self._expect((at.errors / left) ** 2, levels, 0.0, self._own + alone).likelihood
+        errors, alone = _predict(at.errors, information, noise.variances)
+        likelihood = self._expect(errors**2, levels, 0.0, self._own + alone).likelihood
         return MixtureEnd(
             locations=at.locations,
             bound=bound,
@@ -378,6 +388,20 @@ class Mixture:
             levels=levels,
             looseness=noise.variances,
         )
+
+    def _open(self, end: MixtureEnd) -> FloatArray:
+        """Return the variances (m, d - 1) by which to open the directions; 0 where no wrong one gains by it.
+
+        A wrong direction adds nothing to the information, so that the locations stay as loose as it found
+        them. It may lie within that: then it would be right, had it been asked before the floor fell.
+        """
+        at, levels = self._residuals(end.locations), end.levels
+        found = self._expect(at.errors**2 + end.looseness, levels, 0.0)
+        errors, alone = _predict(at.errors, found.information, end.looseness)
+        likelihood = self._expect(errors**2, levels, 0.0, self._own + alone).likelihood
+        is_wrong = _posterior(levels, found.likelihood) < 0.5
+        gains = is_wrong & (_posterior(levels, likelihood) > 0.5)
+        return np.minimum(alone, _MOST_OPENED_RAD**2) if gains.any() else np.zeros_like(alone)
 
     def _told_share(self, expected: FloatArray, levels: Levels, information: FloatArray) -> float:
         """Return the share of the information of known levels that is there while residuals tell these.
@@ -389,13 +413,12 @@ class Mixture:
         change = float(self._expect((1.0 + _PROBE) * expected, levels, 0.0).information.sum()) - total
         return float(np.clip(1.0 + 2.0 / expected.shape[1] * change / _PROBE / total, _LEAST_TOLD, 1.0))
 
-    def _precision(self, lengths: FloatArray) -> float:
-        logs = np.log(lengths)
-        tau = np.clip(_SPREAD * np.mean(np.abs(logs - np.median(logs))), *_TAUS)
-        return float(self._graph.num_nodes / len(logs) / tau**2)
+    def _precisions(self, lengths: FloatArray) -> tuple[float, float]:
+        unit = self._graph.num_nodes / len(lengths) / self._lengths.variance(lengths)
+        return unit / self._lengths.design_effect(lengths), unit
 
     def _cost(self, at: _Residuals, noise: _Noise) -> float:
-        likelihood = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor).likelihood
+        likelihood = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor, noise.own).likelihood
         return _prior_cost(at.lengths, noise.precision) - float(likelihood.sum())
 
     def _equations(self, at: _Residuals, precision: float, found: _Expectation) -> _System:
@@ -420,10 +443,10 @@ class Mixture:
         return True
 
     def _log_determinant(self, system: _System, noise: _Noise) -> float:
-        """Return log det(S) / 2 of the present factor, in units of the prior's precision."""
+        """Return log det(S) / 2 of the present factor, in units of the prior's precision without design effect."""
         n, d = self._graph.num_nodes, self._graph.dimension
         ground = 2.0 * float(np.trace(system.blocks, axis1=1, axis2=2).sum()) / (d * n)  # as `refactor` adds
-        free = d * np.log(ground) + (d * (n - 1) - 1) * np.log(noise.precision)
+        free = d * np.log(ground) + (d * (n - 1) - 1) * np.log(noise.unit)
         return 0.5 * float(free - self._factor.log_determinant())
 
     def _propagate(self, at: _Residuals) -> FloatArray:
@@ -453,6 +476,14 @@ def _maximize(found: _Expectation, expected: FloatArray, levels: Levels, floor: 
     grown = 1.0 + (counts @ _NODES**2 / counts.sum() - 1.0) / gain
     spread = np.clip(levels.spread * np.sqrt(max(grown, 0.0)), *_SPREADS)
     return Levels(_right_share(found.sums), float(mean), float(spread))
+
+
+def _predict(
+    errors: FloatArray, information: FloatArray, variances: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return errors and their variances by the locations, (m, d - 1), as the other directions predict them."""
+    left = 1.0 - np.minimum(information * variances, _MOST_LEVERAGE)
+    return errors / left, np.minimum(variances / left, _LARGEST_VARIANCE)
 
 
 def _right_share(sums: FloatArray) -> float:
