@@ -212,15 +212,15 @@ def leap(rng: np.random.Generator) -> Made:
 
 
 def undetermined(rng: np.random.Generator) -> Made:
-    """Return few images before a wall with a lens twice too long, all adjusted with it: shape is open."""
+    """Return few images before a wall, adjusted with a lens that is held twice too long: shape is open."""
     draft = wall(rng, 8, depth=1.0)
     for k in range(8):
         stretch(draft, k, 2.0)
-    return Made(adjusted(draft.written(one_lens=True), with_lenses=True))
+    return Made(adjusted(draft.written(one_lens=True)))
 
 
-def mixed(rng: np.random.Generator) -> Made:
-    """Return two unrelated scenes in one model, which two false pairs tie."""
+def mixed(rng: np.random.Generator, num_pairs: int) -> Made:
+    """Return two unrelated scenes in one model, which a few false pairs tie."""
     one, other = ring(rng, 14), ring(rng, 10)
     shift = rng.normal(0.0, 2.0, 3) * [1.0, 1.0, 0.1]
     num_points = len(one.points)
@@ -233,8 +233,8 @@ def mixed(rng: np.random.Generator) -> Made:
         np.concatenate([one.distortion, other.distortion]),
         [*one.seen, *seen],
     )
-    for a, b in ((0, 14), (1, 15)):
-        draft.tie(a, b, draft.points, rng)
+    for k in range(num_pairs):
+        draft.tie(k, 14 + k, draft.points, rng)
     return Made(draft.written(one_lens=True))
 
 
@@ -254,7 +254,8 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Made]] = {
     "one camera flies": flyer,
     "one camera leaps": leap,
     "shape undetermined": undetermined,
-    "two scenes mixed": mixed,
+    "two scenes mixed": lambda rng: mixed(rng, 2),
+    "two scenes mixed, by one pair": lambda rng: mixed(rng, 1),
     "poses only": lambda rng: Made(ring(rng).written(has_points=False)),
     "nothing, two devices": two_devices,
     "nothing, object scan": object_scan,
@@ -264,11 +265,11 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Made]] = {
 """Makers by what was done; names of sound ones begin with `nothing`."""
 
 
-def adjusted(model: pycolmap.Reconstruction, *, with_lenses: bool = False) -> pycolmap.Reconstruction:
-    """Adjust a model, its lenses held unless asked for, without the observations that miss; return it."""
+def adjusted(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Adjust a model, its lenses held, without the observations that miss; return it."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.refine_principal_point = False
-    options.refine_focal_length = options.refine_extra_params = with_lenses
+    options.refine_focal_length = options.refine_extra_params = False
     for _ in range(3):
         pycolmap.bundle_adjustment(model, options)
         pycolmap.ObservationManager(model).filter_all_points3D(4.0, 1.0)

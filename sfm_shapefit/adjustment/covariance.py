@@ -9,8 +9,9 @@ coordinates of two frames that tell these motions apart: regular, and as sparse 
 is the covariance with F^T x = 0 (the S-transformation: Baarda 1973, "S-transformations and criterion
 matrices"; Triggs et al. 2000, section 9). F are the centers' parts of N: the best similarity of the centers
 to the true ones is the identity, as in the gauge of `adjust`. Frames that are known far worse than others
-have no part in F: each would lend its own errors to all. Blocks of K^-1 are selected entries; K^-1 F takes
-one solve for each of the at most seven motions.
+have no part in F: each would lend its own errors to all. Nor have those that stand far outside, if the others
+are known better without them: by its lever, a single one decides turn and scale. Blocks of K^-1 are selected
+entries; K^-1 F takes one solve for each of the at most seven motions.
 """
 
 from collections.abc import Callable
@@ -29,6 +30,7 @@ from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points
 from sfm_shapefit.adjustment.solve import linearize_all, values_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import INSIDE, distances_in_spreads
 from sfm_shapefit.base.scipy_parts import dgeqp3
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
@@ -118,6 +120,8 @@ class GroundedSystem:
     """(N, 6, f) how these move the nodes."""
     unseen: BoolArray
     """(n,) frames that see no point."""
+    far: BoolArray
+    """(N,) whether a node is of a frame that stands far outside the others."""
 
     def solve(self, right: FloatArray, *, gauge: bool = True) -> FloatArray:
         """Return Z K^-1 of right sides (N, 6, r); K^-1 alone without the gauge."""
@@ -150,10 +154,18 @@ class GroundedSystem:
         Args:
             variances_in: returns the variance of each node, (N,), in the gauge that a dual reads off.
         """
+
+        def sizes_of(own: IntArray, deciding: IntArray) -> FloatArray:
+            return np.sqrt(np.maximum(variances_in(_dual(self.motions, deciding))[own], 0.0))
+
         nodes = self.seen_nodes()
+        near = nodes[~self.far[nodes]]
+        if 3 <= len(near) < len(nodes):
+            with_far, without = (np.median(sizes_of(near, deciding)) for deciding in (nodes, near))
+            nodes = near if without < with_far else nodes
         least = max(3, len(nodes) // 2)
         for _ in range(_LOOSENING_ROUNDS):
-            sizes = np.sqrt(np.maximum(variances_in(_dual(self.motions, nodes))[nodes], 0.0))
+            sizes = sizes_of(nodes, nodes)
             steady = nodes[sizes <= _LOOSE * np.median(sizes)]
             if len(steady) == len(nodes) or len(steady) < least:
                 break
@@ -185,12 +197,20 @@ def ground_system(problem: AdjustmentProblem, options: AdjustmentOptions) -> Gro
     workers.close()
     free = free_similarities(problem, options)
     motions = _motions(problem, layout, free, unseen)
+    far = np.zeros(layout.num_nodes, np.bool_)
+    far[layout.node_of_frame[own]] = distances_in_spreads(problem.centers, problem.centers)[own] > INSIDE
     factor = choose_factor(layout, options)
     if free.size:
         _ground(system, motions, _two_nodes(problem, layout, unseen))
     _factor(factor, system)
     return GroundedSystem(
-        layout=layout, factor=factor, inverses=system.inverses, free=free, motions=motions, unseen=unseen
+        layout=layout,
+        factor=factor,
+        inverses=system.inverses,
+        free=free,
+        motions=motions,
+        unseen=unseen,
+        far=far,
     )
 
 

@@ -37,6 +37,12 @@ def test_two_scenes_in_one_are_not_good_and_swapped_lenses_are_named():
     assert simple_verdicts(made.model) == {"by error": 1, "by thresholds": 1}
 
 
+@pytest.mark.parametrize("seed", [404, 406])
+def test_a_camera_that_flies_is_named_alone_though_nothing_says_how_far_it_is(seed):
+    made, found = judged("one camera flies", seed)
+    assert set(found.verdict.cameras) == made.wrong  # by its lever, it would lend its error to all
+
+
 def test_a_seed_makes_one_model():
     first, again, other = (judged("one camera flies", seed)[0] for seed in (1, 1, 2))
     places = [
