@@ -21,7 +21,7 @@ from sfm_shapefit.laplacian.operators import LaplacianOperator, Workers, adjacen
 
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
-_SIZES = (1, 2, 4, 8, 16, 32, 64)  # averages with the neighbors after which lengths are compared
+_SIZES = (1, 2, 4, 8, 16, 32, 64)  # averages with the neighbors; 64 more say little more, and cost as much
 _PROBES = 8  # vectors of signs; their mean square is known to a few percent then
 
 

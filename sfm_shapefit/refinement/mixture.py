@@ -7,9 +7,10 @@ rejects the noisy ones or believes wrong ones. Shares of each level that are fre
 coherently wrong pairs, ten times as far off, right and noisy. The density of log s_e is summed at nodes s_k
 of weight w_k, which move with its mean and standard deviation; w_0 is the share of wrong pairs.
 Lengths have a weak prior: cameras that share matches are about as far apart as others that do, whether or not
-their direction is right. All m pairs together count as n observations of it, one a camera:
+their direction is right. All m pairs together count as n / f observations of it, one a camera where these
+differ independently; f is their design effect (`length_prior`):
 
-    (n / m)  sum_e log N(log |d_e|; mean, tau^2),    mean and tau those of the pairs themselves.
+    (n / m f)  sum_e log N(log |d_e|; mean, tau^2),    mean and tau those of the pairs themselves.
 
 What is maximized. Take the posterior of the locations for normal, N(T, S), and independent of which pair has
 which level. The best posterior of the levels for given T and S leaves the variational bound of the evidence
@@ -28,8 +29,10 @@ expected, those of the loosest cameras included: it cannot collapse onto the few
 
 A floor under the levels falls from step to step, which draws a far start in (graduated non-convexity). Two
 ends are compared by their bounds at the noise of the noisier one: the larger consistent set wins, not the
-sharper one. The best end is left by `consensus` for places where more rays meet,
-as long as the bound grows.
+sharper one. The best end is left, as long as the bound grows, by `consensus` for places where more rays meet,
+and by opening pairs: one that was rejected while the locations were poor adds no information, so that these
+stay as loose as it found them, and it is never asked again. If its error is likely as the other pairs predict
+it, all variances J_e S J_e' / (1 - h_e) are added to the levels, and fall to 0 from step to step.
 
 A step takes the mean of 1 / s_e^2 by the posteriors for the information of a pair. That is what a pair of
 known level would say; levels and wrong pairs are known by the residuals alone, and the likelihood curves less
@@ -63,7 +66,7 @@ from sfm_shapefit.solver.program import adjoint, differences
 _LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
 _NODES = np.linspace(-4.0, 4.0, 13)  # standard scores of log levels; finer sums of their density say the same
 _FIRST_FLOOR_RAD = 0.05  # radians; right pairs of a usable start are off by a few of these
-_MOST_OPENED_RAD = 0.25  # radians
+_MOST_OPENED_RAD = 0.25  # radians; wider, a direction says nothing
 _NEXT_FLOOR = 2.0  # typical levels; after a consensus, which is nearer than a start
 _FALL = 0.6  # factor of the floor in a step; slower finds no better ends, and takes longer
 _NOISELESS_RAD = 2.5e-4  # radians; below this floor, a descent whose bound stays has ended
@@ -390,17 +393,13 @@ class Mixture:
         )
 
     def _open(self, end: MixtureEnd) -> FloatArray:
-        """Return the variances (m, d - 1) by which to open the directions; 0 where no wrong one gains by it.
-
-        A wrong direction adds nothing to the information, so that the locations stay as loose as it found
-        them. It may lie within that: then it would be right, had it been asked before the floor fell.
-        """
+        """Return the variances (m, d - 1) that open the directions; 0 if no rejected one is likely."""
         at, levels = self._residuals(end.locations), end.levels
         found = self._expect(at.errors**2 + end.looseness, levels, 0.0)
         errors, alone = _predict(at.errors, found.information, end.looseness)
         likelihood = self._expect(errors**2, levels, 0.0, self._own + alone).likelihood
-        is_wrong = _posterior(levels, found.likelihood) < 0.5
-        gains = is_wrong & (_posterior(levels, likelihood) > 0.5)
+        is_rejected = _posterior(levels, found.likelihood) < 0.5
+        gains = is_rejected & (_posterior(levels, likelihood) > 0.5)
         return np.minimum(alone, _MOST_OPENED_RAD**2) if gains.any() else np.zeros_like(alone)
 
     def _told_share(self, expected: FloatArray, levels: Levels, information: FloatArray) -> float:
@@ -418,7 +417,9 @@ class Mixture:
         return unit / self._lengths.design_effect(lengths), unit
 
     def _cost(self, at: _Residuals, noise: _Noise) -> float:
-        likelihood = self._expect(at.errors**2 + noise.variances, noise.levels, noise.floor, noise.own).likelihood
+        likelihood = self._expect(
+            at.errors**2 + noise.variances, noise.levels, noise.floor, noise.own
+        ).likelihood
         return _prior_cost(at.lengths, noise.precision) - float(likelihood.sum())
 
     def _equations(self, at: _Residuals, precision: float, found: _Expectation) -> _System:
@@ -443,7 +444,7 @@ class Mixture:
         return True
 
     def _log_determinant(self, system: _System, noise: _Noise) -> float:
-        """Return log det(S) / 2 of the present factor, in units of the prior's precision without design effect."""
+        """Return log det(S) / 2 of the present factor, in units of the prior's for independent cameras."""
         n, d = self._graph.num_nodes, self._graph.dimension
         ground = 2.0 * float(np.trace(system.blocks, axis1=1, axis2=2).sum()) / (d * n)  # as `refactor` adds
         free = d * np.log(ground) + (d * (n - 1) - 1) * np.log(noise.unit)
@@ -481,7 +482,7 @@ def _maximize(found: _Expectation, expected: FloatArray, levels: Levels, floor: 
 def _predict(
     errors: FloatArray, information: FloatArray, variances: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return errors and their variances by the locations, (m, d - 1), as the other directions predict them."""
+    """Return errors and their variances by the locations, (m, d - 1), as the others predict them."""
     left = 1.0 - np.minimum(information * variances, _MOST_LEVERAGE)
     return errors / left, np.minimum(variances / left, _LARGEST_VARIANCE)
 

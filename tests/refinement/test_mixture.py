@@ -12,6 +12,7 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import analyze, factorize
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement import mixture
+from sfm_shapefit.refinement.length_prior import LengthPrior
 from tests.graph_families import random_blocks
 from tests.problems import no_mixture, shape_error
 
@@ -269,3 +270,31 @@ def test_starts_that_lead_to_one_place_are_followed_there_once():
     found = place(problem.view_graph)
     assert len(set(found.refined.costs.values())) == 1 < len(found.refined.costs)
     assert found.refined.rivals == ()
+
+
+def road(seed, speed_ratio):
+    return synthetic.trajectory_graph_problem(300, 36, speed_ratio=speed_ratio, sigma=0.01, q=0.2, seed=seed)
+
+
+def test_a_road_of_varying_speed_is_not_pulled_to_one_speed():
+    problem = road(4, 4.0)
+    found = place(problem.view_graph)
+    # 0.0085 by the right pairs alone, and 0.020 where each camera's lengths count.
+    assert shape_error(found.locations, problem.locations) < 0.0125
+
+
+def test_a_right_pair_that_was_rejected_far_from_the_end_is_believed_again():
+    problem = road(1, 4.0)
+    found = place(problem.view_graph)
+    lost = ~problem.corrupted & (found.refined.posterior < 0.5)
+    assert lost.sum() <= 3  # noise alone; 15 are lost by the first descent
+
+
+@pytest.mark.parametrize(("speed_ratio", "least", "most"), [(1.0, 1.0, 1.0), (4.0, 4.0, 40.0)])
+def test_the_design_effect_is_one_where_cameras_step_alike_and_large_where_the_speed_varies(
+    speed_ratio, least, most
+):
+    problem = road(0, speed_ratio)
+    graph = problem.view_graph
+    lengths = np.linalg.norm(np.diff(problem.locations[graph.edges], axis=1)[:, 0], axis=1)
+    assert least <= LengthPrior(graph).design_effect(lengths) <= most
