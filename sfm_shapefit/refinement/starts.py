@@ -324,6 +324,9 @@ def _compare_ends(model: Mixture, candidates: list[_Candidate]) -> tuple[_Candid
     best = candidates[0]
     for other in candidates[1:]:
         best = other if model.lead(other.end, best.end) > 0.0 else best
+    # Starts may lead to one end; the certificate at posteriors is the one that says more of it.
+    same = (found for found in candidates if found.end is best.end and found.reweighted is not None)
+    best = next(same, best)
     end = model.improve(best.end)
     others = (found.end for found in candidates if found.end is not best.end)
     rivals = sorted((Rival(end=x, behind=model.lead(end, x)) for x in others), key=lambda rival: rival.behind)
