@@ -20,7 +20,7 @@ from sfm_shapefit.files.pair_list import read_pair_list
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.memory import ECONOMIES, Economy, Workload, choose_economy
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import Matches, View
+from sfm_shapefit.scene.matches import Matches, PairNames, View
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,6 +63,12 @@ class MatchSource:
             return self
         view = self.matches.at(images, self.inputs.left_out, economy.reading)
         return replace(self, view=view, economy=economy)
+
+    def without(self, pairs: PairNames) -> "MatchSource":
+        """Return the same matches without those of some pairs."""
+        inputs = replace(self.inputs, left_out=self.inputs.left_out | pairs, far=self.inputs.far - pairs)
+        view = self.matches.at(self.images, inputs.left_out, self.economy.reading)
+        return replace(self, inputs=inputs, view=view)
 
     def workload(self, options: PlacingOptions | InspectOptions) -> Workload:
         """Return what is known of the work before any direction is measured."""
