@@ -112,6 +112,8 @@ class Inputs:
     """Whether the database was found beside the model, and nobody asked for it."""
     images: Path | None = None
     """Folder of the pictures that the database was made of, for this run alone; None for any other."""
+    far: PairNames = frozenset()
+    """Pairs of these that are not nearest in pose; sides that are alike contradict a sound model by them."""
 
     @property
     def is_made(self) -> bool:

@@ -4,8 +4,8 @@
     shared      those that see most points of the model together
     unshared    near in pose, but without common points: near duplicates must see the same
     alike       pictures that look alike, wherever their cameras stand: a fold has put them apart
-    seams       nearest and most alike across the weakest links of the model: the longest edges of the
-                shortest tree between the cameras, by common points, else by poses
+    seams       nearest across the weakest links of the model: the longest edges of the shortest tree between
+                the cameras, by common points, else by poses; the most alike across these are "alike"
     others      all the rest, of up to 25 pictures: where sides are alike, likeness finds what contradicts
                 and leaves out what agrees
 
@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.scene.images import Images
@@ -32,6 +32,7 @@ _FEW_IMAGES = 25  # images all of whose pairs are asked: a dozen each
 _NEAR, _LOOKED_AT = 12, 20  # images near in pose, and alike ones, that are looked at; more are never chosen
 _ACROSS = 5  # pairs across a seam, of each kind; three must agree on a turn
 _IMAGES_A_SEAM = 10  # images for each seam that is asked; a tenth of all in a part of its own is too many
+_NEAREST = 3  # neighbors of an image that must agree with a sound model, also where sides are alike
 _FEWEST_SHARED = 15  # points; images with fewer share none, as COLMAP's least matches of a pair have it
 _WORDS = 32  # descriptors that pictures are compared by; more tell hardly more of a hundred pictures
 _STEPS, _MOST_STEPS = 512.0, 31.0  # a signature's numbers in steps of 1 / 512; products of those sum exactly
@@ -46,6 +47,8 @@ class ChosenPairs(NamedTuple):
     """(k, 2) rows of images, i < j."""
     reasons: tuple[str, ...]
     """(k) why each pair is asked, the first reason of the list above."""
+    is_near: BoolArray
+    """(k,) whether it is one of the three nearest in pose of an image, or nearest across a seam."""
 
 
 class Shared(NamedTuple):
@@ -75,10 +78,12 @@ def choose_pairs(images: Images, shared: Shared, descriptors: Sequence[IntArray]
     lists = list(_lists(near, known, alike))
     pairs = np.sort(np.concatenate([own for _, own, _ in lists]), axis=1)
     reasons = np.repeat([reason for reason, _, _ in lists], [len(own) for _, own, _ in lists])
-    order = np.argsort(np.concatenate([rank for *_, rank in lists]), kind="stable")
-    codes = (pairs[:, 0] * len(asked) + pairs[:, 1])[order]
-    order = order[np.sort(np.unique(codes, return_index=True)[1])]
-    return ChosenPairs(asked[pairs[order]], tuple(reasons[order].tolist()))
+    ranks = np.concatenate([rank for *_, rank in lists])
+    order = np.argsort(ranks, kind="stable")
+    codes = pairs[:, 0] * len(asked) + pairs[:, 1]
+    order = order[np.sort(np.unique(codes[order], return_index=True)[1])]
+    is_near = np.isin(codes, codes[(reasons == "seams") | ((reasons == "neighbors") & (ranks < _NEAREST))])
+    return ChosenPairs(asked[pairs[order]], tuple(reasons[order].tolist()), is_near[order])
 
 
 def alike_pairs(descriptors: Sequence[IntArray], most: int) -> IntArray:
@@ -116,7 +121,7 @@ def _lists(near: _Ranked, shared: Shared, alike: _Ranked) -> Iterator[tuple[str,
     most = most[np.lexsort((most[:, 1], -np.tile(shared.counts, 2), most[:, 0]))]
     common = set(map(tuple, most.tolist()))
     apart = np.array([pair not in common for pair in map(tuple, near.pairs().tolist())], dtype=np.bool_)
-    yield "seams", *_across_seams(near, shared, alike)
+    yield from _across_seams(near, shared, alike)
     yield "neighbors", *_first(near.pairs(), _NEIGHBORS, count)
     yield "shared", *_first(most, _SHARED, count)
     yield "unshared", *_first(near.pairs()[apart], _UNSHARED, count)
@@ -133,8 +138,8 @@ def _first(pairs: IntArray, most: int, count: int) -> tuple[IntArray, IntArray]:
     return pairs[rank < most], rank[rank < most]
 
 
-def _across_seams(near: _Ranked, shared: Shared, alike: _Ranked) -> tuple[IntArray, IntArray]:
-    """Return pairs across the longest edges of the shortest tree, and which of its seam each is."""
+def _across_seams(near: _Ranked, shared: Shared, alike: _Ranked) -> Iterator[tuple[str, IntArray, IntArray]]:
+    """Yield a reason, pairs across an edge of the longest of the shortest tree, and how late each is asked."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
 
@@ -144,18 +149,15 @@ def _across_seams(near: _Ranked, shared: Shared, alike: _Ranked) -> tuple[IntArr
     ends, first = np.unique(np.sort(ends, axis=1), axis=0, return_index=True)
     tree = minimum_spanning_tree(coo_array((lengths[first], ends.T), shape=(count, count)).tocsr()).tocoo()
     i, j, length = tree.row, tree.col, tree.data
-    found, ranks = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     for edge in np.argsort(-length, kind="stable")[: -(-count // _IMAGES_A_SEAM)].tolist():
         left = np.arange(len(length)) != edge
         sides = connected_components(count, np.column_stack([i, j])[left].astype(np.int64))
         side = sides == sides[i[edge]]
-        for ranked in (near, alike):
+        for reason, ranked in (("seams", near), ("alike", alike)):
             pairs, cost = ranked.pairs(), ranked.costs.ravel()
             across = np.flatnonzero(side[pairs[:, 0]] != side[pairs[:, 1]])
             taken = across[np.argsort(cost[across], kind="stable")][:_ACROSS]
-            found.append(pairs[taken])
-            ranks.append(np.arange(len(taken)))
-    return np.concatenate(found), np.concatenate(ranks)
+            yield reason, pairs[taken], np.arange(len(taken))
 
 
 def _nearest(centers: FloatArray, axes: FloatArray) -> _Ranked:

@@ -119,6 +119,8 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     unchecked = [k for group in evidence.untied for k in group.cameras.tolist() if k not in apart]
     if unchecked:
         clause = "nothing checks how groups of cameras stand to one another"
+        if len(unchecked) == 1:
+            clause = "nothing checks how one camera stands to the rest"
         yield of_model(Kind.UNCHECKED, clause, images=names(unchecked))
     if second is not None:
         clause = "at least half as much speaks for another place or rotation of it"

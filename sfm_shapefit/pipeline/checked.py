@@ -13,7 +13,7 @@ scripts/results/notes.md.
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -142,8 +142,8 @@ def check_source(
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     with clock("evidence"):
         evidence = gather_evidence(matches, fits, structure, clock.threads)
-        if not matches.has_database:
-            tracks = collect_tracks(model.images, pictures, structure.points)
+        if matches.inputs.is_made or not matches.has_database:  # nothing else measured lenses
+            tracks = collect_tracks(model.images, structure.pictures, structure.points)
             rows = np.arange(model.images.num_images)
             evidence = replace(evidence, shape=ask_shape(model.images, rows, tracks))
         weak = list(_find_weak(model.images, quality))
@@ -152,6 +152,9 @@ def check_source(
             evidence = evidence.beside(second, fits.sides[1])
     reasons = list(_reasons(model, structure, weak, fits, evidence, matches))
     verdict = ModelVerdict.weigh(reasons)
+    if verdict.is_bad and (far := matches.inputs.far):
+        near = check_source(model, matches.without(far), options, clock.anew()).verdict
+        verdict = verdict if near.is_bad else ModelVerdict.weigh(_of_alike_pictures(verdict.findings))
     recognized = recognize_resolution(*structure[:3])
     if verdict.is_bad and recognized is None:
         recognized = ask_convention(matches, clock.threads)
@@ -170,6 +173,15 @@ def check_source(
         facts=CheckedFacts(**facts),
         second_opinion=other and other.source,
     )
+
+
+def _of_alike_pictures(findings: Iterable[Reason]) -> Iterator[Reason]:
+    """Yield findings of pairs far apart in pose alone: where sides are alike, a sound model has them, too."""
+    clause = (
+        "pictures of cameras far apart contradict it, neighbors do not: the scene repeats, or it is folded"
+    )
+    yield of_model(Kind.REPEATED, clause)
+    yield from (replace(one, grade=min(one.grade, Grade.LOOK, key=list(Grade).index)) for one in findings)
 
 
 def _compare(

@@ -78,6 +78,12 @@ class MatchSource:
         view = self.matches.at(images, self.inputs.left_out, economy.reading)
         return replace(self, view=view, economy=economy)
 
+    def without(self, pairs: PairNames) -> "MatchSource":
+        """Return the same matches without those of some pairs."""
+        inputs = replace(self.inputs, left_out=self.inputs.left_out | pairs, far=self.inputs.far - pairs)
+        view = self.matches.at(self.images, inputs.left_out, self.economy.reading)
+        return replace(self, inputs=inputs, view=view)
+
     def workload(self, options: PlacingOptions | InspectOptions) -> Workload:
         """Return what is known of the work before any direction is measured."""
         view, num_images = self.view, self.images.num_images

@@ -70,7 +70,9 @@ def match_pictures(model: ColmapModel, asked: AskedPictures, clock: Clock) -> It
             )
         pictures.name_images()
         statement = _state(asked.folder, states, chosen.reasons, count)
-        yield Inputs(folder=None, database=path, statement=statement, images=asked.folder)
+        rows, names = chosen.pairs[~chosen.is_near].tolist(), model.images.names
+        far = frozenset((min(names[i], names[j]), max(names[i], names[j])) for i, j in rows)
+        yield Inputs(folder=None, database=path, statement=statement, images=asked.folder, far=far)
 
 
 def _refuse_no_pictures(folder: Path, names: Sequence[str], states: Sequence[str]) -> None:
