@@ -139,7 +139,7 @@ def _first(pairs: IntArray, most: int, count: int) -> tuple[IntArray, IntArray]:
 
 
 def _across_seams(near: _Ranked, shared: Shared, alike: _Ranked) -> Iterator[tuple[str, IntArray, IntArray]]:
-    """Yield a reason, pairs across an edge of the longest of the shortest tree, and how late each is asked."""
+    """Yield a reason, pairs across a long edge of the shortest tree, and how late each is asked."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
 
