@@ -70,7 +70,7 @@ def test_sides_that_are_alike_make_a_sound_model_one_to_look_at_and_a_folded_one
     quarter = pycolmap.Rigid3d(pycolmap.Rotation3d(np.sqrt([0.0, 0.0, 0.5, 0.5])), np.zeros(3))
     for image in list(folded.images.values())[7:]:  # half of the cameras a quarter around the tower
         image.frame.rig_from_world = image.frame.rig_from_world * quarter
-    assert check(folded, images=images, second_opinion=False).verdict.is_bad
+    assert check(folded, images=images, second_opinion=False).verdict.grade is not Grade.GOOD
 
 
 def test_pictures_of_another_size_or_shape_or_lost_are_counted(drawn, tmp_path):
