@@ -32,7 +32,7 @@ _FEW_IMAGES = 25  # images all of whose pairs are asked: a dozen each
 _NEAR, _LOOKED_AT = 12, 20  # images near in pose, and alike ones, that are looked at; more are never chosen
 _ACROSS = 5  # pairs across a seam, of each kind; three must agree on a turn
 _IMAGES_A_SEAM = 10  # images for each seam that is asked; a tenth of all in a part of its own is too many
-_NEAREST = 3  # neighbors of an image; they agree with a sound model, also where sides are alike
+_NEAREST = 3  # neighbors of an image that must agree with a sound model, also where sides are alike
 _FEWEST_SHARED = 15  # points; images with fewer share none, as COLMAP's least matches of a pair have it
 _WORDS = 32  # descriptors that pictures are compared by; more tell hardly more of a hundred pictures
 _STEPS, _MOST_STEPS = 512.0, 31.0  # a signature's numbers in steps of 1 / 512; products of those sum exactly
@@ -139,7 +139,7 @@ def _first(pairs: IntArray, most: int, count: int) -> tuple[IntArray, IntArray]:
 
 
 def _across_seams(near: _Ranked, shared: Shared, alike: _Ranked) -> Iterator[tuple[str, IntArray, IntArray]]:
-    """Yield a reason, pairs across a longest edge of the shortest tree, and how late each is asked."""
+    """Yield a reason, pairs across a long edge of the shortest tree, and how late each is asked."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
 

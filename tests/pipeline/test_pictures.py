@@ -9,13 +9,14 @@ import pytest
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.chosen_pairs import Shared, choose_pairs
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pipeline.check import check
-from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rendered_scene
+from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions, make_rendered_scene
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from tests.program import run, run_refused
 from tests.scenes import RING, fingerprint
 
-OPTIONS = SceneOptions(shape="facade", num_images=8, image_width=360, image_height=270, focal_length_px=315.0)
+OPTIONS = SceneOptions(shape="facade", num_images=8, image_width=240, image_height=180, focal_length_px=210.0)
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,23 @@ def test_a_camera_that_was_moved_is_named_and_a_part_that_was_is_not_to_be_used(
     part = check(moved(drawn, names[:3], [1.0, 0.5, 0.0]), images=drawn / "images", second_opinion=False)
     assert part.verdict.is_bad
     assert part.facts.inputs.database is None  # it was made for this run alone
+
+
+def test_sides_that_are_alike_make_a_sound_model_one_to_look_at_and_a_folded_one_no_better(tmp_path):
+    size = {"image_width": 320, "image_height": 240, "focal_length_px": 280.0}
+    tower = make_rendered_scene(
+        SceneOptions(shape="ring", num_images=14, seed=3, **size), RenderOptions(repeated_fraction=0.5)
+    )
+    write_rendered_workspace(tower, tmp_path / "tower", WorkspaceOptions(database=False))
+    model, images = tmp_path / "tower" / "sparse" / "0", tmp_path / "tower" / "images"
+    sound = check(model, images=images, second_opinion=False).verdict
+    assert sound.grade is Grade.LOOK
+    assert "neighbors do not" in sound.reasons[0]
+    folded = pycolmap.Reconstruction(model)
+    quarter = pycolmap.Rigid3d(pycolmap.Rotation3d(np.sqrt([0.0, 0.0, 0.5, 0.5])), np.zeros(3))
+    for image in list(folded.images.values())[7:]:  # half of the cameras a quarter around the tower
+        image.frame.rig_from_world = image.frame.rig_from_world * quarter
+    assert check(folded, images=images, second_opinion=False).verdict.grade is not Grade.GOOD
 
 
 def test_pictures_of_another_size_or_shape_or_lost_are_counted(drawn, tmp_path):
