@@ -12,8 +12,9 @@ other by more than twice as much. A camera that few pairs tie to those follows t
 others that stand elsewhere. The one with twice as many pairs is right; without that, neither is believed.
 
 Another model confirms cameras only if what is usual between the two needs no judge: half a degree at most
-from across the scene, 0.009 spreads. Ten sound models and what `map` makes of their matches differ by 0.007 at most;
-models that a wrong lens bends by 0.02 to 0.16, where no camera stands out (a ring of eight: from 0.004 on).
+from across the scene, 0.009 spreads. Ten sound models and what `map` makes of their matches differ by 0.007
+at most; models that a wrong lens bends by 0.02 to 0.16, where no camera stands out (a ring of eight: from
+0.004 on).
 """
 
 from typing import NamedTuple
