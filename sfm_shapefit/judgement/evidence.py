@@ -195,7 +195,7 @@ class SecondOpinion(NamedTuple):
     undecided: IntArray
     """Rows of those that stand elsewhere, where pairs support neither."""
     confirmed: IntArray
-    """Rows of those that are no farther apart than is usual between the two."""
+    """Rows of those that are no farther apart than is usual between the two, if that is near."""
     num_for: int
     """Pairs that support this model against the other, of `wrong` cameras."""
     num_against: int

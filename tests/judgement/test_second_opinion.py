@@ -74,6 +74,14 @@ def test_models_that_agree_have_all_cameras_confirmed(images, how):
     assert (len(found.wrong), len(found.undecided)) == (0, 0)
 
 
+@pytest.mark.parametrize(("bent", "num_confirmed"), [(0.005, N), (0.1, 0)])
+def test_a_model_that_differs_as_a_whole_confirms_nobody(images, bent, num_confirmed):
+    """A wrong lens stretches all that it sees along one axis; no camera stands out then."""
+    frames = images.frames
+    stretched = replace(images, frames=replace(frames, centers=frames.centers * [1.0 + bent, 1.0, 1.0]))
+    assert len(compare(stretched, images, images).confirmed) == num_confirmed
+
+
 def test_a_camera_that_the_other_model_doubts_is_not_confirmed_by_it(images):
     found = compare(moved(images, [5], shift=2.0), images, images, doubted=[5, 7])
     assert found.ambiguous.tolist() == [7]  # 5 stands elsewhere, where pairs support it
