@@ -46,11 +46,15 @@ def test_the_readmes_python_example_runs_and_says_what_the_readme_says(monkeypat
 
 def test_the_peers_fold_the_yard_and_map_does_not(tmp_path):
     shutil.copy(PHOTOGRAPHED / "database.db", tmp_path)
-    database = tmp_path / "database.db"
+    database, same = tmp_path / "database.db", {"random_seed": 0, "num_threads": 1}
     with quiet_log():
         models = {
-            "COLMAP": pycolmap.incremental_mapping(database, tmp_path, tmp_path / "incremental")[0],
-            "GLOMAP": pycolmap.global_mapping(database, tmp_path, tmp_path / "global")[0],
+            "COLMAP": pycolmap.incremental_mapping(
+                database, tmp_path, tmp_path / "incremental", pycolmap.IncrementalPipelineOptions(**same)
+            )[0],
+            "GLOMAP": pycolmap.global_mapping(
+                database, tmp_path, tmp_path / "global", pycolmap.GlobalPipelineOptions(**same)
+            )[0],
             "map": sfm_shapefit.map_database(database),
         }
     names = ["0004.jpg", "0005.jpg"]
