@@ -10,7 +10,9 @@ Pairing = Literal["auto", "exhaustive", "sequential", "retrieval"]
 
 MATCHING_FILE = "matching.json"
 """Beside a database made of photographs: the options with which it was made, with which it is gone on."""
-MADE_FIRST = (MATCHING_FILE, *(f"database.db{ending}" for ending in ("", "-wal", "-shm", "-journal")))
+SIDECARS = ("-wal", "-journal", "-shm")
+"""Endings of the companions of a database."""
+MADE_FIRST = (MATCHING_FILE, *(f"database.db{ending}" for ending in ("", *SIDECARS)))
 """Files that `map` makes of photographs in its folder before the models."""
 
 MOST_EXHAUSTIVE = 200

@@ -13,6 +13,7 @@ from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import flat_values, merge_options
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.files.colmap.photographs import PhotographDatabase, find_photographs, refuse_lens
+from sfm_shapefit.files.colmap.picture_matches import read_descriptors
 from sfm_shapefit.files.options import MATCHING_FILE, MOST_EXHAUSTIVE, MatchingOptions
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, alike_pairs
 from sfm_shapefit.pipeline.clock import Clock, Progress
@@ -126,4 +127,4 @@ def _match(made: PhotographDatabase, pairing: str, clock: Clock) -> None:
     if pairing == "sequential":
         made.match_sequentially(clock.advance)
     most = _ALIKE_OF_SEQUENCE if pairing == "sequential" else _ALIKE
-    return made.match_pairs(alike_pairs(made.descriptors(NUM_DESCRIBED), most), clock.advance)
+    return made.match_pairs(alike_pairs(read_descriptors(made.database, NUM_DESCRIBED), most), clock.advance)

@@ -21,7 +21,7 @@ from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.picture_matches import PictureMatches
+from sfm_shapefit.files.colmap.picture_matches import PictureMatches, read_descriptors
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, Shared, choose_pairs
@@ -63,7 +63,9 @@ def match_pictures(model: ColmapModel, asked: AskedPictures, clock: Clock) -> It
         _refuse_no_pictures(asked.folder, model.images.names, states)
         tracks = TrackMatches(model)
         shared = Shared(tracks.pairs, tracks.num_matches)
-        chosen = choose_pairs(model.images, shared, pictures.descriptors(NUM_DESCRIBED))
+        chosen = choose_pairs(
+            model.images, shared, read_descriptors(path, NUM_DESCRIBED, model.images.ids.tolist())
+        )
         with clock("matches"):
             count = pictures.match(
                 chosen.pairs, lambda: time.monotonic() > began + 60.0 * minutes, clock.advance

@@ -25,13 +25,12 @@ from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import covariance_of, covariances_text, own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
 from sfm_shapefit.files.colmap.seed import write_model
-from sfm_shapefit.files.options import MADE_FIRST
+from sfm_shapefit.files.options import MADE_FIRST, SIDECARS
 from sfm_shapefit.pipeline.colors import Result, with_colors
 
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
 
-_SIDECARS = ("-wal", "-journal", "-shm")  # endings of the companions of a database
 _WRITTEN = {".html", ".glb", ".ply", ".csv", ".json", ".tum", ".txt"}
 """Suffixes of single files that commands write, perhaps into the folder of a model."""
 _READ = {
@@ -182,7 +181,7 @@ def refuse_file(page: Path, *, overwrite: bool, protect: Iterable[Path | str] = 
 def _is_of(page: Path, source: Path) -> bool:
     """Return whether a file is an input, a companion of one, or a file of a folder that is one."""
     if not source.is_dir():
-        names = [source.name + suffix for suffix in ("", *_SIDECARS)]
+        names = [source.name + suffix for suffix in ("", *SIDECARS)]
         names += ["tracks.csv"] * (source.suffix.lower() == ".json")  # OpenSfM's
         return any(_is_same(page, source.with_name(name)) for name in names)
     if not page.exists():

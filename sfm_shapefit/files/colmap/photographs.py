@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.files.colmap.bitmaps import earth_position, read_bitmap
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, name_of
 from sfm_shapefit.files.options import MatchingOptions
@@ -128,30 +130,14 @@ class PhotographDatabase:
         )
         extraction.sift.max_num_features = told.max_num_features
 
-        def call(token: Any) -> None:
-            pycolmap.extract_features(
-                self.database,
-                self.folder,
-                [bytes_of_name(name) for name in missing],  # type: ignore[misc]
-                reader_options=reader,
-                extraction_options=extraction,
-                cancellation_token=token,
-            )
+        how: dict[str, Any] = {"reader_options": reader, "extraction_options": extraction}
+        names: Any = [bytes_of_name(name) for name in missing]
+        call = partial(pycolmap.extract_features, self.database, self.folder, names, **how)
 
         def count(database: pycolmap.Database) -> int:
             return sum(database.exists_descriptors(image.image_id) for image in images)
 
         self._watch(call, count, len(images), advance)
-
-    def descriptors(self, most: int) -> list[IntArray]:
-        """Return the SIFT descriptors (k, 128) of each image, those of its largest features."""
-        with quiet_log(), pycolmap.Database.open(self.database) as database:
-            return [
-                database.read_descriptors(image.image_id).data[:most].astype(np.int64)
-                if database.exists_descriptors(image.image_id)
-                else np.zeros((0, 128), dtype=np.int64)
-                for image in _images_of(database)
-            ]
 
     def match_exhaustively(self, advance: Advance) -> None:
         """Match and verify all pairs that are not yet matched."""
@@ -192,15 +178,12 @@ class PhotographDatabase:
         matching = pycolmap.FeatureMatchingOptions(num_threads=self.threads)
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = _SEED
-
-        def call(token: Any) -> None:
-            how(self.database, matching, pairing, verification, cancellation_token=token)
-
+        call = partial(how, self.database, matching, pairing, verification)
         self._watch(call, pycolmap.Database.num_verified_image_pairs, total, advance)
 
     def _watch(
         self,
-        call: Callable[[Any], None],
+        call: Callable[..., None],
         count: Callable[[pycolmap.Database], int],
         total: int,
         advance: Advance,
@@ -212,7 +195,7 @@ class PhotographDatabase:
         """
         token = pycolmap.CancellationToken()
         with quiet_log(), ThreadPoolExecutor(1) as pool, pycolmap.Database.open(self.database) as database:
-            future = pool.submit(call, token)
+            future = pool.submit(call, cancellation_token=token)
             try:
                 while not wait([future], _POLL_S).done:
                     advance(min(count(database), total), total)
@@ -297,16 +280,11 @@ def _numbers(text: str, count: int) -> list[float]:
 
 def _read(path: Path) -> _Picture | None:
     """Read what an image says of its lens and place; None if pycolmap cannot read it."""
-    bitmap = pycolmap.Bitmap.read(path, True)
+    bitmap = read_bitmap(path)
     if bitmap is None:
         return None
-    latitude, longitude, altitude = bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()
-    position = None
-    if latitude is not None and longitude is not None:
-        position = latitude, longitude, np.nan if altitude is None else altitude
-    return _Picture(
-        bitmap.width, bitmap.height, bitmap.exif_camera_model(), bitmap.exif_focal_length(), position
-    )
+    device, focal = bitmap.exif_camera_model(), bitmap.exif_focal_length()
+    return _Picture(bitmap.width, bitmap.height, device, focal, earth_position(bitmap))
 
 
 def _write_image(database: pycolmap.Database, name: str, lens: pycolmap.Camera, picture: _Picture) -> None:

@@ -1,6 +1,5 @@
 """Colors of 3D points from pictures, by COLMAP's rule: the mean of all pixels that see a point."""
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +10,7 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.paths import file_of
+from sfm_shapefit.files.colmap.bitmaps import read_bitmap
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.points import Keypoints, points2d_of, points_of
 from sfm_shapefit.files.colmap.quiet import quiet_log
@@ -30,10 +30,7 @@ class PictureFolder(NamedTuple):
 
 def read_picture(file: Path) -> Rgb | None:
     """Return a picture (height, width, 3), red first, as COLMAP reads it; None if it is none."""
-    try:
-        bitmap = pycolmap.Bitmap.read(os.fsencode(file), as_rgb=True)
-    except (ValueError, RuntimeError, MemoryError):
-        return None
+    bitmap = read_bitmap(file)
     return None if bitmap is None else np.asarray(bitmap.to_array(), dtype=np.uint8)
 
 

@@ -8,7 +8,7 @@ count as calibrated. Ids are those of the model, so that the order in which thre
 
 import copy
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -119,16 +119,6 @@ class PictureMatches:
                 database.write_descriptors(int(images.ids[k]), found.read_descriptors(image.image_id))
                 yield "asked"
 
-    def descriptors(self, most: int) -> list[IntArray]:
-        """Return the SIFT descriptors (k, 128) of each image, those of its largest features."""
-        with quiet_log(), pycolmap.Database.open(self.database) as database:
-            return [
-                database.read_descriptors(i).data[:most].astype(np.int64)
-                if database.exists_descriptors(i)
-                else np.zeros((0, 128), dtype=np.int64)
-                for i in self.model.images.ids.tolist()
-            ]
-
     def match(self, pairs: IntArray, is_over: IsOver, advance: Advance) -> int:
         """Match pairs (k, 2) of images, verify them by the model's lenses, and return how many were asked."""
         listed, ids = self.database.with_name("pairs.txt"), self.model.images.ids
@@ -155,6 +145,18 @@ class PictureMatches:
                 image = database.read_image(image_id)
                 image.name = bytes_of_name(name)  # type: ignore[assignment]
                 database.update_image(image)
+
+
+def read_descriptors(path: Path, most: int, ids: Sequence[int] | None = None) -> list[IntArray]:
+    """Return the SIFT descriptors (k, 128) of images, of all by ids if None, those of large features."""
+    with quiet_log(), pycolmap.Database.open(path) as database:
+        every = sorted(image.image_id for image in database.read_all_images()) if ids is None else ids
+        return [
+            database.read_descriptors(i).data[:most].astype(np.int64)
+            if database.exists_descriptors(i)
+            else np.zeros((0, 128), dtype=np.int64)
+            for i in every
+        ]
 
 
 def find_pictures(folder: Path, names: tuple[str, ...]) -> list[Path | None]:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import counted, counted_are
+from sfm_shapefit.files.colmap.bitmaps import earth_position, read_bitmap
 from sfm_shapefit.files.colmap.geodesy import datum_of, enu_of, unwrapped
 from sfm_shapefit.files.colmap.pose_prior_json import read_pose_prior_json
 from sfm_shapefit.files.colmap.position_table import (
@@ -110,11 +110,9 @@ def exif_priors(folder: Path, images: Images) -> PositionPriors:
     """
     found: dict[str, list[float]] = {}
     for name in images.names:
-        bitmap = pycolmap.Bitmap.read(folder / name, True) if (folder / name).is_file() else None
-        if bitmap is not None:
-            read = bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()
-            if None not in read[:2]:
-                found[name] = [np.nan if value is None else value for value in read]
+        bitmap = read_bitmap(folder / name) if (folder / name).is_file() else None
+        if bitmap is not None and (place := earth_position(bitmap)) is not None:
+            found[name] = list(place)
     positions = np.array(list(found.values())).reshape(-1, 3)
     table = PositionTable(tuple(found), positions, np.full((len(found), 3, 3), np.nan), "geodetic")
     return _priors(table, images, str(folder), f"EXIF data of {len(found)} images of {folder}")
