@@ -174,6 +174,31 @@ def test_a_run_that_was_interrupted_goes_on_and_ends_as_one_that_was_not(drawn, 
         assert (begun / "0" / name).read_bytes() == (out / "0" / name).read_bytes()
 
 
+@pytest.mark.parametrize("stage", ["images", "features", "matches"])
+def test_a_stage_that_is_interrupted_leaves_the_lenses_as_they_would_be(drawn, stage, tmp_path):
+    """Four images are read but for two, or a later stage begins; a fifth is added before the second run."""
+
+    def interrupt(name, done, _total):
+        if name == stage and (done == 2 or stage != "images"):
+            raise KeyboardInterrupt
+
+    _, folder = drawn
+    names = sorted(os.listdir(folder / "images"))[:5]
+    images, few = tmp_path / "images", {"max_num_features": 100}
+    images.mkdir()
+    for name in names[:4]:
+        shutil.copy(folder / "images" / name, images)
+    with pytest.raises(KeyboardInterrupt):
+        sfm_shapefit.match_images(images, tmp_path / "database.db", progress=interrupt, **few)
+    shutil.copy(folder / "images" / names[4], images)
+    made = sfm_shapefit.match_images(images, tmp_path / "database.db", **few)
+    found = survey(made)
+    assert found["cameras"] == dict.fromkeys(names, 1)
+    assert found["pairs"] == 10
+    with pycolmap.Database.open(made) as opened:
+        assert (opened.num_frames(), opened.num_rigs()) == (5, 1)
+
+
 def test_a_second_run_keeps_the_matches(drawn, told, mapped):
     _, folder = drawn
     out, _ = mapped

@@ -8,6 +8,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -95,17 +96,28 @@ class PhotographDatabase:
                 "remove it, or choose another OUT"
             )
         missing = [name for name in self.names if name not in known]
-        unreadable = []
+        pictures = {}
+        with quiet_log(), ThreadPoolExecutor(self.threads) as pool:
+            with closing(pool.map(self._read, missing)) as read:
+                for k, picture in enumerate(read):
+                    pictures[missing[k]] = picture
+                    advance(k + 1, len(missing))
+            pool.submit(self._write, {name: one for name, one in pictures.items() if one}).result()
+        return [name for name, picture in pictures.items() if picture is None]
+
+    def _read(self, name: str) -> "_Picture | None":
+        return _read(self.folder / name)
+
+    def _write(self, pictures: dict[str, "_Picture"]) -> None:
+        """Write images; in a thread, as an interrupt reaches the main one alone: all are written, or none."""
         with quiet_log(), pycolmap.Database.open(self.database) as database:
             lenses = _Lenses(self.options, database)
-            with ThreadPoolExecutor(self.threads) as pool, pycolmap.DatabaseTransaction(database):
-                for k, picture in enumerate(pool.map(lambda name: _read(self.folder / name), missing)):
-                    if picture is None:
-                        unreadable.append(missing[k])
-                    else:
-                        _write_image(database, missing[k], lenses.lens_of(missing[k], picture), picture)
-                    advance(k + 1, len(missing))
-        return unreadable
+            for camera_id, image in _first_images(database).items():
+                if picture := self._read(name_of(image)):
+                    lenses.known[lenses.key(name_of(image), picture)] = database.read_camera(camera_id)
+            with pycolmap.DatabaseTransaction(database):
+                for name, picture in pictures.items():
+                    _write_image(database, name, lenses.lens_of(name, picture), picture)
 
     def known_names(self) -> list[str]:
         """Return the names of the images of the database by their ids; none where it does not exist."""
@@ -209,6 +221,11 @@ def _images_of(database: pycolmap.Database) -> list[pycolmap.Image]:
     return sorted(database.read_all_images(), key=lambda image: image.image_id)
 
 
+def _first_images(database: pycolmap.Database) -> dict[int, pycolmap.Image]:
+    """Return the first image that each lens took; images of a lens have in common what decides it."""
+    return {image.camera_id: image for image in reversed(_images_of(database))}
+
+
 @dataclass(slots=True)
 class _Lenses:
     """The lenses of a database in the making."""
@@ -219,12 +236,12 @@ class _Lenses:
 
     def lens_of(self, name: str, picture: _Picture) -> pycolmap.Camera:
         """Return the lens of an image, which is written with a rig of its own if it is new."""
-        key = self._key(name, picture)
+        key = self.key(name, picture)
         if key not in self.known:
             self.known[key] = self._write(picture)
         return self.known[key]
 
-    def _key(self, name: str, picture: _Picture) -> Hashable:
+    def key(self, name: str, picture: _Picture) -> Hashable:
         """Return what images of one lens have in common; images of two sizes never share one."""
         mode, size, folder = (
             self.options.camera_mode,
