@@ -14,7 +14,7 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 
-NAMES = ("beyond", "noise_robustness", "phase_transition", "photographs", "theory_plot")
+NAMES = ("beyond", "fold", "noise_robustness", "phase_transition", "photographs", "theory_plot")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
