@@ -36,6 +36,9 @@ class MatchingOptions(Settings):
     mask_path: str = option(
         "", "Folder of masks, NAME.png for image NAME; there are no features where a mask is black."
     )
+    rig_config_path: str = option(
+        "", "COLMAP's JSON file of rigs: which images are sensors of one rig, and the poses of the sensors."
+    )
     max_image_size: int = option(-1, "Pixels of the longer side at which features are found, -1 for all.")
     max_num_features: int = option(8192, "Features of an image, the largest first.")
     pairing: Pairing = option(

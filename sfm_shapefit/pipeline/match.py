@@ -12,7 +12,12 @@ from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import flat_values, merge_options
 from sfm_shapefit.base.wording import first_of
-from sfm_shapefit.files.colmap.photographs import PhotographDatabase, find_photographs, refuse_lens
+from sfm_shapefit.files.colmap.photographs import (
+    PhotographDatabase,
+    find_photographs,
+    refuse_lens,
+    refuse_rigs,
+)
 from sfm_shapefit.files.colmap.picture_matches import read_descriptors
 from sfm_shapefit.files.options import MATCHING_FILE, MOST_EXHAUSTIVE, MatchingOptions
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, alike_pairs
@@ -60,10 +65,12 @@ def match_images(
     refuse_lens(options)
     if options.mask_path:
         refuse_no_folder(Path(options.mask_path))
+    found = find_photographs(folder)
+    refuse_rigs(options, found)
     made = PhotographDatabase(
         folder=folder,
         database=path,
-        names=find_photographs(folder),
+        names=found,
         options=options,
         threads=clock.threads,
     )

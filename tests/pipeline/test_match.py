@@ -209,6 +209,71 @@ def test_a_second_run_keeps_the_matches(drawn, told, mapped):
     assert not (out / "0" / "report.html").exists()
 
 
+def rigs_of(database):
+    """Sensors of each rig by their cameras, and the names of the images of each frame."""
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        rigs = [
+            sorted([rig.ref_sensor_id.id, *(sensor.id for sensor in rig.non_ref_sensors)])
+            for rig in opened.read_all_rigs()
+        ]
+        frames = [sorted(names[one.id] for one in frame.image_ids) for frame in opened.read_all_frames()]
+    return sorted(rigs), sorted(frames)
+
+
+def test_images_become_sensors_of_the_rigs_of_a_file_also_those_that_are_added(drawn, tmp_path):
+    """One device takes left and right, as its EXIF data say; each side has a lens of its own all the same."""
+    _, folder = drawn
+    names = sorted(os.listdir(folder / "images"))[:7]
+    images, few = tmp_path / "images", {"max_num_features": 100}
+    images.mkdir()
+
+    def take(*places):
+        for place in places:
+            picture = (folder / "images" / names.pop()).read_bytes()
+            (images / place).write_bytes(with_exif(picture, "Phone 1", 28, 48))
+
+    config = tmp_path / "rigs.json"
+    sensors = [
+        {"image_prefix": "left_", "ref_sensor": True},
+        {
+            "image_prefix": "right_",
+            "cam_from_rig_rotation": [1, 0, 0, 0],
+            "cam_from_rig_translation": [-0.5, 0, 0],
+        },
+    ]
+    config.write_text(json.dumps([{"cameras": sensors}]))
+    take("alone.jpg", "left_1.jpg", "right_1.jpg", "left_2.jpg", "right_2.jpg")
+    made = tmp_path / "database.db"
+    for added in ((), ("left_3.jpg", "right_3.jpg")):
+        take(*added)
+        sfm_shapefit.match_images(images, made, rig_config_path=str(config), **few)
+    assert rigs_of(made) == (
+        [[1], [2, 3]],
+        [["alone.jpg"], *(sorted([f"left_{k}.jpg", f"right_{k}.jpg"]) for k in (1, 2, 3))],
+    )
+    with pycolmap.Database.open(made) as opened:
+        (pose,) = [pose for rig in opened.read_all_rigs() for pose in rig.non_ref_sensors.values()]
+    np.testing.assert_array_equal(pose.translation, [-0.5, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("[{", "no file of rigs as COLMAP's rig_configurator takes"),
+        ('[{"cameras": [{"image_prefix": "0"}]}]', "must have one reference sensor"),
+        ('[{"cameras": [{"image_prefix": "b/", "ref_sensor": true}]}]', "no image begins with b/"),
+    ],
+)
+def test_rigs_that_the_images_cannot_be_are_refused(drawn, tmp_path, text, why):
+    _, folder = drawn
+    config = tmp_path / "rigs.json"
+    config.write_text(text)
+    told = ("--rig-config-path", config)
+    assert why in run_refused("map", folder / "images", tmp_path / "out", *told, code=3)
+    assert not (tmp_path / "out").exists()
+
+
 def test_images_are_matched_with_those_next_in_order_and_those_that_look_alike(drawn, tmp_path):
     scene, folder = drawn
     few = {"max_num_features": 300}

@@ -8,7 +8,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -98,10 +97,13 @@ class PhotographDatabase:
         missing = [name for name in self.names if name not in known]
         pictures = {}
         with quiet_log(), ThreadPoolExecutor(self.threads) as pool:
-            with closing(pool.map(self._read, missing)) as read:
-                for k, picture in enumerate(read):
+            try:
+                for k, picture in enumerate(pool.map(self._read, missing)):
                     pictures[missing[k]] = picture
                     advance(k + 1, len(missing))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
             pool.submit(self._write, {name: one for name, one in pictures.items() if one}).result()
         return [name for name, picture in pictures.items() if picture is None]
 
@@ -111,13 +113,15 @@ class PhotographDatabase:
     def _write(self, pictures: dict[str, "_Picture"]) -> None:
         """Write images; in a thread, as an interrupt reaches the main one alone: all are written, or none."""
         with quiet_log(), pycolmap.Database.open(self.database) as database:
-            lenses = _Lenses(self.options, database)
+            prefixes = tuple(_prefixes_of(read_rigs(self.options)))
+            lenses = _Lenses(self.options, database, prefixes)
             for camera_id, image in _first_images(database).items():
                 if picture := self._read(name_of(image)):
                     lenses.known[lenses.key(name_of(image), picture)] = database.read_camera(camera_id)
             with pycolmap.DatabaseTransaction(database):
                 for name, picture in pictures.items():
                     _write_image(database, name, lenses.lens_of(name, picture), picture)
+                pycolmap.apply_rig_config(read_rigs(self.options), database)  # a rig for each other lens, too
 
     def known_names(self) -> list[str]:
         """Return the names of the images of the database by their ids; none where it does not exist."""
@@ -232,22 +236,22 @@ class _Lenses:
 
     options: MatchingOptions
     database: pycolmap.Database
+    prefixes: tuple[str, ...]
+    """How the names of each sensor's images begin, if it is one of a rig."""
     known: dict[Hashable, pycolmap.Camera] = field(default_factory=dict)
 
     def lens_of(self, name: str, picture: _Picture) -> pycolmap.Camera:
-        """Return the lens of an image, which is written with a rig of its own if it is new."""
+        """Return the lens of an image, which is written if it is new."""
         key = self.key(name, picture)
         if key not in self.known:
             self.known[key] = self._write(picture)
         return self.known[key]
 
     def key(self, name: str, picture: _Picture) -> Hashable:
-        """Return what images of one lens have in common; images of two sizes never share one."""
-        mode, size, folder = (
-            self.options.camera_mode,
-            (picture.width, picture.height),
-            name.rpartition("/")[0],
-        )
+        """Return what images of one lens have in common; those of two sizes or sensors never share one."""
+        mode, folder = self.options.camera_mode, name.rpartition("/")[0]
+        sensor = next((prefix for prefix in self.prefixes if name.startswith(prefix)), None)
+        size = sensor, picture.width, picture.height
         if mode == "per-image":
             return name
         if mode == "single":
@@ -264,10 +268,43 @@ class _Lenses:
             camera.params = _numbers(told, len(camera.params))
         camera.has_prior_focal_length = bool(told) or picture.focal is not None
         camera.camera_id = self.database.write_camera(camera)
-        rig = pycolmap.Rig(rig_id=camera.camera_id)
-        rig.add_ref_sensor(camera.sensor_id)
-        self.database.write_rig(rig, use_rig_id=True)
         return camera
+
+
+def read_rigs(options: MatchingOptions) -> list[pycolmap.RigConfig]:
+    """Read the rigs of the options; none where they name no file.
+
+    Raises:
+        InputError: if pycolmap cannot read the file.
+    """
+    if not options.rig_config_path:
+        return []
+    path = Path(options.rig_config_path)
+    if not path.is_file():
+        raise InputError(f"{path} does not exist or is no file")
+    try:
+        with quiet_log():
+            return list(pycolmap.read_rig_config(path))
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"{path} is no file of rigs as COLMAP's rig_configurator takes: {error}") from None
+
+
+def refuse_rigs(options: MatchingOptions, names: Sequence[str]) -> None:
+    """Refuse rigs that these images cannot be.
+
+    Raises:
+        InputError: if no image begins with a sensor's prefix.
+    """
+    for prefix in _prefixes_of(read_rigs(options)):
+        if not any(name.startswith(prefix) for name in names):
+            raise InputError(
+                f"{options.rig_config_path}: no image begins with {prefix}; the first is {names[0]}"
+            )
+
+
+def _prefixes_of(rigs: Sequence[pycolmap.RigConfig]) -> list[str]:
+    """Return how the names of each sensor's images begin."""
+    return [str(sensor.image_prefix) for rig in rigs for sensor in rig.cameras]
 
 
 def refuse_lens(options: MatchingOptions) -> None:
@@ -305,12 +342,9 @@ def _read(path: Path) -> _Picture | None:
 
 
 def _write_image(database: pycolmap.Database, name: str, lens: pycolmap.Camera, picture: _Picture) -> None:
-    """Write an image, the frame that holds it alone, and its position on Earth as a prior."""
+    """Write an image, and its position on Earth as a prior."""
     image = pycolmap.Image(name=bytes_of_name(name), camera_id=lens.camera_id)
     image.image_id = database.write_image(image)
-    frame = pycolmap.Frame(rig_id=lens.camera_id)
-    frame.add_data_id(image.data_id)
-    database.write_frame(frame)
     if picture.position is not None:
         prior = pycolmap.PosePrior(
             position=np.array(picture.position),
