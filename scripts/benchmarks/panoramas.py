@@ -31,7 +31,7 @@ from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.synthetic import RenderedScene, RenderOptions, SceneOptions, make_rendered_scene
 from sfm_shapefit.synthetic.rendering import Canvas, draw_image
 
-PANORAMAS, CUBEMAPS = "panoramas", "cubemap rig"
+PANORAMAS, CUBEMAPS, FISHEYES = "panoramas", "cubemap rig", "two fisheyes"
 _NOISE, _QUALITY = 2.0, 92  # gray levels; of JPEG
 _WIDTH = (
     3.2  # of a panorama, in sides of a face: as many pixels for a degree on the horizon as in a face's middle
@@ -69,14 +69,19 @@ def measure(kind: str, places: int, side: int) -> list[Row]:
 
 
 def draw(kind: str, scene: RenderedScene, folder: Path) -> None:
-    """Write the pictures of all places: faces in a folder each, or panoramas."""
+    """Write the pictures of all places: faces or fisheyes in a folder each, or panoramas.
+
+    The two fisheyes look ahead and back; as all faces do, they have one center.
+    """
     side = scene.options.image_width
     turned = np.concatenate([FACES @ rotation for rotation in scene.rotations])
     faces = replace(scene, rotations=turned, centers=np.repeat(scene.centers, 6, axis=0))
     canvas, noise = Canvas.of(scene), np.random.default_rng(0)
     for place in range(len(scene.centers)):
         pictures = [draw_image(faces, 6 * place + k, canvas).astype(np.float32) for k in range(6)]
-        pictures = [_panorama(pictures, side)] if kind == PANORAMAS else pictures
+        if kind != CUBEMAPS:
+            turns = FACES[[0, 2]] if kind == FISHEYES else FACES[:1]
+            pictures = [_resampled(pictures, _camera(kind, side), turn) for turn in turns]
         for k, picture in enumerate(pictures):
             noisy = picture + noise.normal(0.0, _NOISE, picture.shape)
             path = folder / f"{k}" / f"{place:04d}.jpg"
@@ -85,11 +90,11 @@ def draw(kind: str, scene: RenderedScene, folder: Path) -> None:
             cv2.imwrite(str(path), bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
 
 
-def _panorama(faces: list[np.ndarray], side: int) -> np.ndarray:
-    """Return the panorama of six faces, sampled where each of its pixels looks."""
-    camera = _camera(PANORAMAS, side)
+def _resampled(faces: list[np.ndarray], camera: pycolmap.Camera, turn: FloatArray) -> np.ndarray:
+    """Return the picture of a turned camera, sampled from six faces where each of its pixels looks."""
+    side = len(faces[0])
     v, u = np.indices((camera.height, camera.width)) + 0.5
-    rays = np.asarray(camera.cam_ray_from_img(np.column_stack([u.ravel(), v.ravel()])))
+    rays = np.asarray(camera.cam_ray_from_img(np.column_stack([u.ravel(), v.ravel()]))) @ turn
     which = np.argmax(rays @ FACES[:, 2].T, axis=1).reshape(u.shape)
     found = np.empty((*u.shape, 3), dtype=np.float32)
     for k, face in enumerate(faces):
@@ -106,6 +111,9 @@ def _camera(kind: str, side: int) -> pycolmap.Camera:
     if kind == PANORAMAS:
         size = 2 * round(_WIDTH * side / 2), round(_WIDTH * side / 2)
         return pycolmap.Camera.create_from_model_name(1, "EQUIRECTANGULAR", 1.0, *size)
+    if kind == FISHEYES:  # 180 degrees fill the picture
+        width = round(_WIDTH * side / 2)
+        return pycolmap.Camera.create_from_model_name(1, "OPENCV_FISHEYE", width / np.pi, width, width)
     return pycolmap.Camera.create_from_model_name(1, "PINHOLE", side / 2, side, side)
 
 

@@ -88,9 +88,18 @@ def find_uncalibrated(
     return {number: one for number, one in found.items() if one.origin not in known}
 
 
+def fisheye_guess(camera: pycolmap.Camera) -> float:
+    """Return the focal length in pixels with which 180 degrees fill the picture.
+
+    It is written as a prior: without one COLMAP verifies pairs by a fundamental matrix of pixels, which
+    fisheyes have not.
+    """
+    return float(max(camera.width, camera.height) / np.pi)
+
+
 def _origin(camera: pycolmap.Camera) -> Origin:
     """Return where the intrinsics of a camera of a database come from, by itself alone."""
-    if not camera.has_prior_focal_length:
+    if not camera.has_prior_focal_length or camera.mean_focal_length() == fisheye_guess(camera):
         return Origin.GUESS
     fresh = pycolmap.Camera.create_from_model_id(1, camera.model, 1.0, camera.width, camera.height)
     others = slice(len(camera.focal_length_idxs()), None)  # principal point, and coefficients if it has any

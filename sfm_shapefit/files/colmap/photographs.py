@@ -22,6 +22,7 @@ from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.files.colmap.bitmaps import earth_position, read_bitmap
+from sfm_shapefit.files.colmap.intrinsics import fisheye_guess
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, name_of
 from sfm_shapefit.files.options import MatchingOptions
@@ -113,7 +114,7 @@ class PhotographDatabase:
     def _write(self, pictures: dict[str, "_Picture"]) -> None:
         """Write images; in a thread, as an interrupt reaches the main one alone: all are written, or none."""
         with quiet_log(), pycolmap.Database.open(self.database) as database:
-            prefixes = tuple(_prefixes_of(read_rigs(self.options)))
+            prefixes = tuple(_prefixes_of(_read_rigs(self.options)))
             lenses = _Lenses(self.options, database, prefixes)
             for camera_id, image in _first_images(database).items():
                 if picture := self._read(name_of(image)):
@@ -121,7 +122,9 @@ class PhotographDatabase:
             with pycolmap.DatabaseTransaction(database):
                 for name, picture in pictures.items():
                     _write_image(database, name, lenses.lens_of(name, picture), picture)
-                pycolmap.apply_rig_config(read_rigs(self.options), database)  # a rig for each other lens, too
+                pycolmap.apply_rig_config(
+                    _read_rigs(self.options), database
+                )  # a rig for each other lens, too
 
     def known_names(self) -> list[str]:
         """Return the names of the images of the database by their ids; none where it does not exist."""
@@ -260,18 +263,20 @@ class _Lenses:
         return (*size, picture.device, picture.focal) if is_known else (*size, folder, picture.focal)
 
     def _write(self, picture: _Picture) -> pycolmap.Camera:
-        guess = _DEFAULT_FOCAL * max(picture.width, picture.height)
-        focal, told = picture.focal or guess, self.options.camera_params
-        size = picture.width, picture.height
+        size, told = (picture.width, picture.height), self.options.camera_params
+        focal = picture.focal or _DEFAULT_FOCAL * max(size)
         camera = pycolmap.Camera.create_from_model_name(0, self.options.camera_model, focal, *size)
+        is_fisheye = "FISHEYE" in self.options.camera_model
+        if is_fisheye and not picture.focal:
+            camera.focal_length = fisheye_guess(camera)
         if told:
             camera.params = _numbers(told, len(camera.params))
-        camera.has_prior_focal_length = bool(told) or picture.focal is not None
+        camera.has_prior_focal_length = bool(told) or picture.focal is not None or is_fisheye
         camera.camera_id = self.database.write_camera(camera)
         return camera
 
 
-def read_rigs(options: MatchingOptions) -> list[pycolmap.RigConfig]:
+def _read_rigs(options: MatchingOptions) -> list[pycolmap.RigConfig]:
     """Read the rigs of the options; none where they name no file.
 
     Raises:
@@ -295,7 +300,7 @@ def refuse_rigs(options: MatchingOptions, names: Sequence[str]) -> None:
     Raises:
         InputError: if no image begins with a sensor's prefix.
     """
-    for prefix in _prefixes_of(read_rigs(options)):
+    for prefix in _prefixes_of(_read_rigs(options)):
         if not any(name.startswith(prefix) for name in names):
             raise InputError(
                 f"{options.rig_config_path}: no image begins with {prefix}; the first is {names[0]}"
