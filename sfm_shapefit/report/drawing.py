@@ -98,6 +98,18 @@ class CameraColumn(NamedTuple):
     """(n,) NaN where it is not known."""
 
 
+class LensRow(NamedTuple):
+    """A lens as the page lists it; lengths in pixels."""
+
+    id: str
+    model: str
+    num_images: str
+    size: str
+    focal_length: str
+    principal_point: str
+    distortion: str
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pairs:
     """The m rows of pairs.csv."""
@@ -160,6 +172,8 @@ class Drawing:
     """Iteration, objective and bound of the convex solve, as far as they were recorded."""
     further: tuple[CameraColumn, ...] = ()
     """Further figures of the cameras."""
+    lenses: tuple[LensRow, ...] = ()
+    """All lenses of the model."""
 
     def shifts(self) -> FloatArray:
         """(n,) how far cameras stand from where the input has them; NaN where the two cannot be compared."""

@@ -44,9 +44,9 @@ def tiles(drawing: Drawing, facts: Facts) -> list[dict[str, str]]:
     """Return the key figures: value, label, what it means, and whether it is good."""
     return [
         _placed_tile(drawing),
-        *_figure_tiles(facts),
         _doubtful_tile(drawing, facts),
         *_points_tile(drawing, facts),
+        *_figure_tiles(facts),
         *_shift_tile(drawing),
         *_track_tile(facts),
     ]

@@ -136,6 +136,7 @@ def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None 
         "matrix": view_graph_matrix(drawing.pairs, rank),
         "convergence": _convergence(drawing),
         "notes": _notes(drawing, residuals_deg),
+        "lenses": [[shorten(cell) for cell in lens] for lens in drawing.lenses[:_MAX_ROWS]],
         "intrinsics": _cells(facts, "intrinsics", lambda lens: -abs(lens.change)),
         "control": _cells(facts, "control_points", lambda point: -(point.error or 0.0)),
         "loops": _cells(facts, "loops", lambda loop: (-loop.num_refused, -loop.num_matches)),

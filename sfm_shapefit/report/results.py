@@ -1,6 +1,7 @@
 """Drawings of what was placed, joined or judged."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -13,7 +14,9 @@ from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.files.colmap.seed import pick_points
 from sfm_shapefit.judgement.image_quality import ImageQuality
-from sfm_shapefit.report.drawing import MAX_POINTS, CameraColumn, Drawing, build_drawing, poses_of
+from sfm_shapefit.report.drawing import MAX_POINTS, CameraColumn, Drawing, LensRow, build_drawing, poses_of
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Lens
 
 
 def draw_result(found: LocateResult | GraphResult) -> Drawing:
@@ -36,6 +39,7 @@ def draw_result(found: LocateResult | GraphResult) -> Drawing:
         dimension=placement.graph.dimension,
         input_is_aligned=isinstance(found, LocateResult) and found.gauge.scale == "input",
         history=tuple((info.iteration, info.objective, info.dual_bound) for info in placement.history),
+        lenses=_lenses(found.images) if isinstance(found, LocateResult) else (),
     )
 
 
@@ -70,7 +74,26 @@ def _draw_as_it_stands(model: ColmapModel, cameras: Sequence[CameraRow], pairs: 
     poses = poses_of(model.images, [row.name for row in cameras])
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
     points = pick_points(model.arrays, MAX_POINTS)
-    return build_drawing(cameras, pairs, poses=poses, points=points)
+    return replace(build_drawing(cameras, pairs, poses=poses, points=points), lenses=_lenses(model.images))
+
+
+def _lenses(images: Images) -> tuple[LensRow, ...]:
+    """Return the lenses that images were taken through, the most used first."""
+    counts = Counter(images.lens_of.tolist())
+    return tuple(_lens_row(images.lenses[row], count) for row, count in counts.most_common())
+
+
+def _lens_row(lens: Lens, num_images: int) -> LensRow:
+    focal, point, distortion = lens.split_parameters()
+    return LensRow(
+        str(lens.id),
+        lens.model,
+        f"{num_images:,}",
+        f"{lens.width} x {lens.height}",
+        ", ".join(f"{value:,.1f}" for value in focal),
+        ", ".join(f"{value:,.1f}" for value in point),
+        ", ".join(f"{value:.4g}" for value in distortion),
+    )
 
 
 def _columns(quality: ImageQuality, num_cameras: int) -> Iterator[CameraColumn]:

@@ -7,7 +7,7 @@ Sentences are plain text. Names in them come from strangers: whoever shows a sen
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -65,13 +65,32 @@ def first_looks(drawing: Drawing, facts: Facts) -> list[Hint]:
     if facts.verdict.grade is Grade.GOOD:  # what is of note there is no task
         return list(_warnings(drawing, facts, set()))
     cameras = [*_left_out(drawing), *_least_trusted(drawing), *_weak(drawing, facts)]
-    return [
-        *_warnings(drawing, facts, {hint.camera for hint in cameras}),
-        *cameras,
-        *_contradictions(drawing, is_told=any("of the pairs contradict" in text for text in facts.warnings)),
-        *_loose(facts),
-        *_unchecked(drawing),
-    ]
+    return _one_of_each_camera(
+        [
+            *_warnings(drawing, facts, {hint.camera for hint in cameras}),
+            *cameras,
+            *_contradictions(
+                drawing, is_told=any("of the pairs contradict" in text for text in facts.warnings)
+            ),
+            *_loose(facts),
+            *_unchecked(drawing),
+        ]
+    )
+
+
+def _one_of_each_camera(hints: list[Hint]) -> list[Hint]:
+    """Return the hints with all that is said of a camera in one, where the first stands."""
+    texts: dict[int, list[str]] = {}
+    for hint in hints:
+        if hint.camera is not None:
+            texts.setdefault(hint.camera, []).append(hint.text)
+    found = []
+    for hint in hints:
+        if hint.camera is None:
+            found.append(hint)
+        elif said := texts.pop(hint.camera, None):
+            found.append(replace(hint, text="; ".join(said)))
+    return found
 
 
 def placed_sentence(drawing: Drawing) -> str:

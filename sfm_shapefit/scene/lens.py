@@ -169,6 +169,11 @@ class Lens:
             return _LENS_MODELS[self.model].num_focal
         return 0 if self.is_panorama else 2 - self.model.startswith(_ONE_FOCAL_LENGTH)
 
+    def split_parameters(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+        """Return focal lengths, principal point and distortion."""
+        count = self._num_focal
+        return self.parameters[:count], self.parameters[count : count + 2], self.parameters[count + 2 :]
+
     def bent(self, coefficient: float) -> "Lens":
         """Return the lens with another first coefficient."""
         first = self._num_focal + 2

@@ -200,8 +200,11 @@ def test_layers_sizes_colors_and_the_theme_can_be_switched_and_the_scene_follows
     assert modes == ["trust", "uncertainty", "error of its pairs", "shift from the input"]
     driver.execute_script("const m = document.getElementById('mode'); m.value = '3'; m.onchange();")
     assert driver.execute_script(COLORS)["count"] != larger["count"]
+    page = "return getComputedStyle(document.body).backgroundColor"
+    background = driver.execute_script(page)
     click(driver, "#theme")
-    assert driver.execute_script(COLORS)["common"] != before["common"]
+    assert driver.execute_script(page) != background
+    assert driver.execute_script(COLORS)["common"] == before["common"]  # the ground that shows the points
     assert complaints(driver) == []
 
 
@@ -211,6 +214,18 @@ CUT_TEXTS = """
       return own.width > 0 && (own.left < chart.left - 1 || own.right > chart.right + 1);
     }).map((text) => text.textContent);
 """
+
+
+@pytest.mark.parametrize("shade", [0, 40, 230])
+def test_the_ground_is_light_behind_dark_points_and_dark_behind_light_ones(driver, shade, tmp_path):
+    drawing, facts = make_drawing()
+    colors = np.full_like(drawing.points.colors, shade)
+    path = tmp_path / "report.html"
+    write_report(replace(drawing, points=drawing.points._replace(colors=colors)), facts, path)
+    opened(driver, path)
+    ground = driver.execute_script(COLORS)["common"]
+    red = ground >> 16
+    assert red < 64 if shade == 230 else red > 192
 
 
 def test_it_fits_a_narrow_window_and_a_row_brings_the_scene_into_view(driver, report):

@@ -56,3 +56,11 @@ def test_the_inputs_centers_are_brought_into_the_outputs_units():
         assert (found is not None) == seen
         if seen:
             np.testing.assert_allclose(found[placed], cameras.centers[placed], atol=1e-6)
+
+
+def test_every_lens_is_listed_with_what_the_model_has():
+    found = locate(FACADE / "sparse" / "0")
+    (row,) = draw_result(found).lenses
+    (camera,) = found.reconstruction.cameras.values()
+    assert (row.id, row.model, row.num_images) == (str(camera.camera_id), camera.model.name, "9")
+    assert row.focal_length == ", ".join(f"{camera.params[k]:,.1f}" for k in camera.focal_length_idxs())

@@ -90,7 +90,7 @@ const isDark = () => {
   const chosen = document.documentElement.dataset.theme;
   return chosen ? chosen === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
 };
-const probe = document.body.appendChild(element("i"));
+const probe = $("scene").appendChild(element("i"));
 probe.hidden = true;
 // [red, green, blue] in 0..1 of a color of the style sheet, looked up once per theme.
 const shades = new Map();

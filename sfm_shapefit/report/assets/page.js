@@ -95,6 +95,8 @@ const drawPieces = () => {
   $("pieces-note").textContent = data.notes.pieces;
 };
 const drawControl = () => {
+  $("lenses-card").hidden = !data.lenses.length;
+  fill("lenses", plainTable(["Camera", "Model", "Images", "Picture (px)", "Focal length (px)", "Principal point (px)", "Distortion"], data.lenses));
   $("intrinsics-card").hidden = !data.intrinsics.length;
   fill("intrinsics", plainTable(["Camera", "Model", "Images", "Focal length given (px)", "Found (px)", "Change", "Distortion"], data.intrinsics));
   $("control-card").hidden = !data.control.length;

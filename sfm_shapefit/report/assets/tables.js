@@ -123,7 +123,8 @@ const verdictCell = (p) => {
 };
 const drawTables = (onChoice) => {
   // Rows arrive worst first: the cameras by trust, the pairs by verdict and residual.
-  const why = (k) => reason(cameras.reason[k]) || (isPlaced(k) ? "" : "left out");
+  const isSaid = new Set(data.looks.map(({ camera }) => camera));
+  const why = (k) => (isSaid.has(k) ? "" : reason(cameras.reason[k]) || (isPlaced(k) ? "" : "left out"));
   const shift = cameras.shift ? [numeric("Shift", (k) => cameras.shift[k], 2, "How far it is from where the input has it, in units")] : [];
   return {
     camera: makeTable("cameras", "camera", numCameras, [

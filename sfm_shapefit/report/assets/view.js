@@ -82,17 +82,17 @@ const makeScene = (onChoice) => {
     return { center, u: u.map((part, k) => part - center[k]) };
   };
   const ellipsoidColumns = (chosen) => ({ center: gather(chosen, cameras.center, 3), ...vectorsOf(chosen, cameras.ellipsoids) });
-  // Dark points would vanish on a dark page and light ones on a light page; points without colors are gray.
+  // Dark points would vanish on a dark ground and light ones on a light ground; points without colors are gray.
   const pointOrder = spread(points.positions.length / 3);
+  const isGray = points.colors.every((part) => part === 0);
+  if (!isGray) $("scene").dataset.ground = quantile(points.colors, 0.5) < 128 ? "light" : "dark";
   const pointColors = () => {
     const colors = gather(pointOrder, points.colors, 3);
     const gray = rgbOf("--soft").map((part) => 255 * part);
-    const isGray = colors.every((part) => part === 0);
-    const dark = isDark();
     const found = new Uint8Array((4 * colors.length) / 3);
     for (let k = 0, to = 0; k < colors.length; k += 3, to += 4) {
       for (let c = 0; c < 3; c++) {
-        found[to + c] = isGray ? gray[c] : dark ? 64 + 0.75 * colors[k + c] : 0.8 * colors[k + c];
+        found[to + c] = isGray ? gray[c] : colors[k + c];
       }
       found[to + 3] = 255;
     }
@@ -269,7 +269,7 @@ const makeScene = (onChoice) => {
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.round(side * ratio));
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    painter.begin(rgbOf("--card"));
+    painter.begin(rgbOf("--ground"));
     const common = { matrix: eye.matrix(), viewport: [width, height], near: eye.near() };
     for (const name of ORDER) {
       const one = layer(name);
