@@ -44,9 +44,10 @@ def tiles(drawing: Drawing, facts: Facts) -> list[dict[str, str]]:
     """Return the key figures: value, label, what it means, and whether it is good."""
     return [
         _placed_tile(drawing),
-        _doubtful_tile(drawing, facts),
+        *_uncertainty_tile(facts),
         *_points_tile(drawing, facts),
-        *_figure_tiles(facts),
+        _doubtful_tile(drawing, facts),
+        *_error_tile(facts),
         *_shift_tile(drawing),
         *_track_tile(facts),
     ]
@@ -116,7 +117,7 @@ def _placed_tile(drawing: Drawing) -> dict[str, str]:
     return _tile(f"{placed:,} of {total:,}", f"{drawing.noun}s placed", hint, mood)
 
 
-def _figure_tiles(facts: Facts) -> Iterator[dict[str, str]]:
+def _error_tile(facts: Facts) -> Iterator[dict[str, str]]:
     figures = facts.figures
     if figures.pair_error_deg is not None:
         angle = f"{rounded(figures.pair_error_deg, digits=2)}°"
@@ -126,7 +127,11 @@ def _figure_tiles(facts: Facts) -> Iterator[dict[str, str]]:
             "Median angle between what the matches of a pair say and where its cameras stand; in pixels at "
             "the middle of a picture.",
         )
-    sigma, share, of = figures.sigma, figures.sigma_of_extent, facts.sigma_of
+
+
+def _uncertainty_tile(facts: Facts) -> Iterator[dict[str, str]]:
+    figures, of = facts.figures, facts.sigma_of
+    sigma, share = figures.sigma, figures.sigma_of_extent
     if sigma is not None and share is not None and share <= 1.0:  # beyond, nothing is known of it
         label = f"typical uncertainty, {100.0 * share:.2g}% of the scene{scope_of(of)}"
         hint = f"Median standard deviation of a position: {sigma:.2g} {figures.sigma_unit} ({of})."

@@ -295,6 +295,14 @@ def test_what_map_made_and_is_not_to_be_used_is_inspected_where_it_was_written()
 def test_tiles_tell_errors_in_pixels_and_degrees_and_how_uncertain_positions_are():
     drawing, facts = make_drawing()
     shown = {tile["label"]: tile["value"] for tile in tiles(drawing, facts)}
+    order = (
+        "cameras placed",
+        "typical uncertainty",
+        "3D points",
+        "camera to check",
+        "typical error of a pair",
+    )
+    assert [one for label in shown for one in order if label.startswith(one)] == list(order)
     assert shown["cameras placed"] == "24 of 25"
     assert shown["typical error of a pair"] == "1.4 px, 0.08°"
     assert shown["camera to check"] == "1"

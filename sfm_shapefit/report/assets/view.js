@@ -11,6 +11,7 @@ const SLOW_FRAME_MS = 50;
 const REST_MS = 200; // the scene rests so long after the last move, and the time of two frames
 const COARSEST = 3; // levels of detail while the scene moves
 const SHARES = [1, 1, 0.25, 0.06]; // of points and pairs, by level
+const MOST_AWAY = 3; // distance of the first view over that from which the cameras alone fill it
 const LEAST_FRUSTUM_PX = 12; // at first sight, frusta are at least so deep,
 const FRUSTUM_STEPS = 2.5; // but not more than so many times as far as the next camera is
 
@@ -432,9 +433,12 @@ const makeScene = (onChoice) => {
   const whole = () => {
     Object.assign(view, { yaw: Math.atan2(-0.84, 0.35), pitch: 0.43 });
     if (data.dimension === 2) Object.assign(view, { yaw: -Math.PI / 2, pitch: 1.57 });
-    const groups = [{ positions: mainCameras, outside: 0 }, { positions: nearPoints, outside: 0.03 }];
-    const [target, distance] = eye.framing(groups.filter(({ positions }) => positions.length), middle);
-    return distance > 0.5 * radius ? [target, distance] : [middle, 4 * radius];
+    const own = [{ positions: mainCameras, outside: 0 }];
+    const groups = [...own, { positions: nearPoints, outside: 0.03 }].filter(({ positions }) => positions.length);
+    const [target, distance] = eye.framing(groups, middle);
+    if (distance <= 0.5 * radius) return [middle, 4 * radius];
+    const [among, close] = mainCameras.length > 2 ? eye.framing(own, middle) : [target, distance];
+    return close > 0 && distance > MOST_AWAY * close ? [among, MOST_AWAY * close] : [target, distance];
   };
   // Along a street, frusta that are deeper than a few steps between cameras would be one band.
   const roomOfFrusta = () => {
