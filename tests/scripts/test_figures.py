@@ -2,14 +2,24 @@
 
 import os
 import pickle
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import figure
+import report_picture
+from make_data import SCENES
 from paper import noise_robustness, phase_transition, theory_plot
 from paper.trials import METHODS, Cell, run_batch, run_trials
+from sfm_shapefit.synthetic import draw_image, make_rendered_scene
+from tests.program import run
+from tests.scenes import PHOTOGRAPHED, ROOT
+
+DOCS = ROOT / "docs"
 
 CELLS = [Cell(12, 0.0), Cell(12, 0.2, 0.05)]
 
@@ -95,3 +105,29 @@ def test_the_theory_plot_has_a_quick_mode_and_grants_less_than_is_recovered(tmp_
     granted, recovered = (float(dense.split(word)[1].split()[0]) for word in ("granted ", "recovered "))
     assert dense.split()[0] == "1:"  # every pair: the theorems speak
     assert 0.0 < granted < 1e-6 < recovered
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["fold", "photographs"])
+def test_pictures_of_the_docs_are_what_their_commands_draw(name, tmp_path):
+    """Versions of a font differ by gray levels at the edges of letters."""
+    figure.main([name, "--out", str(tmp_path / "made.png")])
+    made, kept = (np.asarray(Image.open(path)) for path in (tmp_path / "made.png", DOCS / f"{name}.png"))
+    assert made.shape == kept.shape
+    assert np.abs(made.astype(float) - kept).mean() < 1.0
+
+
+@pytest.mark.slow
+def test_the_pictures_of_the_report_say_what_the_report_says_today(tmp_path, monkeypatch):
+    scene = make_rendered_scene(SCENES["photographed"].scene, SCENES["photographed"].render)
+    monkeypatch.chdir(tmp_path)
+    images = Path("yard/images")
+    images.mkdir(parents=True)
+    for k in range(scene.num_images):
+        Image.fromarray(draw_image(scene, k)).save(images / f"{k + 1:04d}.jpg")
+    shutil.copy(PHOTOGRAPHED / "database.db", "yard")
+    run("map", "yard/database.db", "yard_mapped", "--images", images, code=0)
+    report_picture.main(["yard_mapped", "made.png"])
+    words = Image.open("made.png").text["words"]
+    for name in ("report.png", "report_camera.png"):
+        assert Image.open(DOCS / name).text["words"] == words
