@@ -214,6 +214,11 @@ def ground_system(problem: AdjustmentProblem, options: AdjustmentOptions) -> Gro
     )
 
 
+def motions_read_by(system: GroundedSystem) -> FloatArray:
+    """Return F (F^T N)^-1, (N, 6, f), of all frames that move and are seen."""
+    return _dual(system.motions, system.seen_nodes())
+
+
 def _motions(problem: AdjustmentProblem, layout: Layout, free: FloatArray, unseen: BoolArray) -> FloatArray:
     """Return N (N, 6, f) at the nodes; lenses do not take part, nor do frames that nothing sees."""
     moves = small_similarities(problem.rotations, problem.centers, problem.centers.mean(axis=0)) @ free

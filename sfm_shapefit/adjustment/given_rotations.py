@@ -166,6 +166,12 @@ def noise_of(median_error_px: float, unknowns: int, num_observations: int) -> fl
     return float(median_error_px / _MEDIAN_LENGTH / np.sqrt(redundancy))
 
 
+def noise_px_of(problem: AdjustmentProblem) -> float:
+    """Return the standard deviation of an observation per axis, px, by the median error."""
+    unknowns = 3 * problem.num_points + 6 * problem.num_frames
+    return noise_of(float(np.nanmedian(reprojection_errors_px(problem))), unknowns, problem.num_observations)
+
+
 def without_unseen_turns(
     errors: RotationErrors, problem: AdjustmentProblem, options: AdjustmentOptions, fitting: FloatArray
 ) -> RotationErrors:

@@ -20,11 +20,9 @@ import numpy as np
 
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
-from sfm_shapefit.adjustment.given_rotations import noise_of
+from sfm_shapefit.adjustment.given_rotations import noise_px_of
 from sfm_shapefit.adjustment.lens_doubts import excess
-from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.run import FINE_TIMES, MOST_FRAMES, begin
-from sfm_shapefit.adjustment.solve import reprojection_errors_px
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import INSIDE, distances_in_spreads, fit_similarity_l1
@@ -60,7 +58,7 @@ def estimate_open_shape(
     try:
         run = begin(images, tracks, StructureOptions(), freedom, GivenPoses())
         tracks, found, problem = run.problem_of_all(checked=True)
-        run = replace(run, freedom=replace(run.freedom, noise_px=_noise_px(problem)))
+        run = replace(run, freedom=replace(run.freedom, noise_px=noise_px_of(problem)))
         few = run.thin_problem(tracks, found, times=FINE_TIMES)
         after, _ = run.solve(few, _FALL, settles_points=True)
         options = after.options_at_optimum()
@@ -85,9 +83,3 @@ def _drift(before: Images, after: Images) -> FloatArray:
     inside = distances_in_spreads(own, own) <= INSIDE
     apart = fit_similarity_l1(moved[inside], own[inside]).apply(moved) - own
     return np.asarray(np.sum(apart**2, axis=1)[:, None, None] / 3.0 * np.eye(3))
-
-
-def _noise_px(problem: AdjustmentProblem) -> float:
-    """Return the standard deviation of an observation per axis, by the median error."""
-    unknowns = 3 * problem.num_points + 6 * problem.num_frames
-    return noise_of(float(np.nanmedian(reprojection_errors_px(problem))), unknowns, problem.num_observations)

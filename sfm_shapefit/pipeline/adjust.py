@@ -1,19 +1,23 @@
 """`bundle_adjust`: poses and points of a model adjusted by its own observations; for pipelines."""
 
-from collections.abc import Collection
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.covariance import FrameCovariances, estimate_covariances
 from sfm_shapefit.adjustment.freedom import GivenPoses
+from sfm_shapefit.adjustment.given_rotations import noise_px_of
+from sfm_shapefit.adjustment.lengths import estimate_lengths
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.solve import Adjusted, adjust
 from sfm_shapefit.adjustment.sources import collect_tracks
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays
@@ -24,10 +28,29 @@ from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import ObservedTracks
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 
+_WITHIN_95 = 1.96  # standard deviations on either side that hold 95 % of a normal distribution
+
 if TYPE_CHECKING:
     import pycolmap
 
     from sfm_shapefit.files.colmap.model import HoldsModel
+
+
+class Length(NamedTuple):
+    """A distance in units of the model."""
+
+    value: float
+    sigma: float
+    """Its standard deviation."""
+
+    @property
+    def half_width(self) -> float:
+        """Half the interval that holds the distance with a probability of 95 %."""
+        return _WITHIN_95 * self.sigma
+
+    def __str__(self) -> str:
+        digits = max(1 - math.floor(math.log10(self.half_width)), 0) if self.half_width > 0.0 else 6
+        return f"{self.value:.{digits}f} ± {self.half_width:.{digits}f} (95 %)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -42,6 +65,43 @@ class AdjustedModel(Displayed):
     """The answer as arrays: costs, iterations, why it ended."""
     covariances: FrameCovariances | None
     """Covariances of the frames' centers and rotations, if they were asked for."""
+    options: AdjustmentOptions
+    """As it was adjusted with."""
+    cameras: Mapping[str, int]
+    """Camera of the problem that is each posed image, by its name."""
+    points: Mapping[int, int]
+    """Row of each point of the problem, by its id."""
+
+    def length(self, first: str | int, second: str | int, *, scale_sigma: float = 0.0) -> "Length":
+        """Return the distance between two images or points, and how well it is known.
+
+            print(adjusted.length("0001.jpg", "0004.jpg"))          # 2.503 ± 0.004 (95 %)
+            print(adjusted.length(17, 402, scale_sigma=0.001))      # between two 3D points
+
+        The noise of the observations is read off their errors; wrong calibration and wrong pairs are not
+        covered. Where nothing but the scene itself holds the scale, the distance is known relative to its
+        size: `scale_sigma`, as of `found.facts`, is what is to be added.
+
+        Args:
+            first, second: names of images, whose centers are meant, or ids of 3D points.
+            scale_sigma: relative standard deviation of the scale.
+
+        Raises:
+            InputError: if there is no such image or point.
+            UnsolvableError: if the observations leave more open than a similarity.
+        """
+        solved = self.adjusted.problem
+        ends = np.array([[self._row_of(first), self._row_of(second)]])
+        options = replace(self.options, noise_px=noise_px_of(solved))
+        (distance,), (sigma,) = (values.tolist() for values in estimate_lengths(solved, options, ends))
+        return Length(distance, float(np.hypot(sigma, scale_sigma * distance)))
+
+    def _row_of(self, end: str | int) -> int:
+        known: Mapping[Any, int] = self.cameras if isinstance(end, str) else self.points
+        if end not in known:
+            what = "posed image" if isinstance(end, str) else "3D point that two images see"
+            raise InputError(f"the model has no {what} {end}")
+        return known[end] + (0 if isinstance(end, str) else len(self.adjusted.problem.rig.frame_of_camera))
 
     def summary(self) -> dict[str, Any]:
         """Return the main figures in plain values."""
@@ -102,6 +162,9 @@ def bundle_adjust(
         frame_ids=tuple(images.frames.ids.tolist()),
         adjusted=adjusted,
         covariances=estimate_covariances(solved, options) if covariances else None,
+        options=options,
+        cameras={images.names[k]: int(np.searchsorted(views.images, k)) for k in range(len(images.names))},
+        points=dict(zip(points.ids.tolist(), range(points.num_points), strict=True)),
     )
 
 
