@@ -17,7 +17,7 @@ from sfm_shapefit.adjustment.solve import linearize_all, values_of
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.laplacian.operators import Workers
 
-_PACKED = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # places of the entries of a point's packed block
+_PACKED = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # places in a point's packed block; it is symmetric
 
 
 def estimate_lengths(

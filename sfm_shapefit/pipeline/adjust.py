@@ -28,7 +28,7 @@ from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import ObservedTracks
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 
-_WITHIN_95 = 1.96  # standard deviations on either side that hold 95 % of a normal distribution
+_WITHIN_95 = 1.96  # standard deviations; between them on either side lie 95 % of a normal distribution
 
 if TYPE_CHECKING:
     import pycolmap
