@@ -48,7 +48,7 @@ class AdjustmentOptions(Settings):
     )
     linear_solver: LinearSolver = option(
         "auto",
-        "How the system of the cameras is factored: dense by LAPACK, or sparse in blocks; auto is dense up "
+        "How the system of the cameras is factored: one dense matrix, or sparse in blocks; auto is dense up "
         "to 3,000 unknowns (500 cameras).",
     )
     threads: int = option(1, "Threads that share the work; the answer is the same whatever their number.")
