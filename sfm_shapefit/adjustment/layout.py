@@ -12,6 +12,7 @@ Where nothing but free sensors tells the scale, the longest of their baselines k
 moves in the plane across it, `sensor_bases` has no third column, and the slot is empty.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +23,7 @@ from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.geometry import normalized, tangent_bases
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.scene.lens import NUM_VALUES, PARTS
+from sfm_shapefit.scene.lens import NUM_VALUES, PARTS, Lens
 
 SLOTS = 6  # unknowns of a node at most; a frame has six, a lens no more
 _LEAST_SHARED = 0.1  # share of a lens's points; those that have less in common would only fill a node
@@ -141,7 +142,7 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
         scale_sensor=scale_sensor,
         active=active,
         lens_slots=lens_slots,
-        held_of_lens=np.array([lens.row()[NUM_VALUES:] for lens in problem.lenses]).reshape(-1, 9),
+        held_of_lens=held_of(problem.lenses),
         observation=order,
         first_observation=np.searchsorted(point, np.arange(problem.num_points + 1)),
         camera=camera,
@@ -164,6 +165,11 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
         turns=not options.hold_rotations,
         link_pair=np.searchsorted(pair_keys, links[:, 0] * len(active) + links[:, 1]),
     )
+
+
+def held_of(lenses: Sequence[Lens]) -> FloatArray:
+    """Return the numbers of each lens that never change, (l, 9)."""
+    return np.array([lens.row()[NUM_VALUES:] for lens in lenses]).reshape(-1, 9)
 
 
 def find_scale_sensor(problem: AdjustmentProblem) -> int:

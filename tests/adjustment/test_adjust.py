@@ -348,7 +348,7 @@ def make_bent_row(num_cameras, bend):
         lenses=(Lens("SIMPLE_PINHOLE", LENSES["SIMPLE_PINHOLE"]),),
         lens_of_camera=np.zeros(num_cameras, dtype=np.int64),
     )
-    exact = reprojection_residuals(lay_out(truth, AdjustmentOptions()), values_of(truth))
+    exact = reprojection_residuals(truth, values_of(truth))
     truth = replace(truth, pixels=exact + 0.5 * rng.standard_normal(exact.shape))
     along = centers[:, 0] / half - 1.0
     turns = Rotation.from_euler("z", np.arctan(2.0 * bend / half * along[:, None])).as_matrix()
@@ -471,7 +471,7 @@ def test_wrong_priors_lenses_and_options_are_refused():
     for wrong in (
         {"loss_scale_px": 0.0},
         {"noise_px": np.inf},
-        {"threads": 0},
+        {"threads": -1},
         {"linear_solver": "lu"},
         {"first_damping": -1e-4},
     ):
