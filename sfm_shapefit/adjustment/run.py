@@ -509,6 +509,17 @@ def solve_by_all_points(
     return run, views_of(run.images).seen_points(joined, found), last
 
 
+def solve_known_points(run: AdjustmentRun, points: FloatArray) -> Solved:
+    """Return the run after two solves by points (k, 3) that are there, one for each track of its links.
+
+    No other is triangulated, and none is left out. InputError if no image observes a point.
+    """
+    assert isinstance(run.links, ObservedTracks)
+    problem = run.problem(run.links, TriangulatedPoints.of_tracks(run.links, points))
+    run, problem = run.solve(problem, FIRST_FALL, settles_points=True)
+    return run.solve(problem, LAST_FALL, first_damping=_NEAR_DAMPING, settles_points=True)
+
+
 def solve_from_seed(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem, float]:
     """Return what `solve_by_all_points` does, after few where poses are coarse; and the first mean error."""
     joined, found = run.triangulate(1.0, checked=True)

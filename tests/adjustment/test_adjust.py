@@ -248,13 +248,18 @@ def test_entries_given_up_while_a_system_is_factored_change_nothing(monkeypatch,
 
 @pytest.mark.parametrize("solver", ["dense", "sparse"])
 def test_threads_do_not_change_one_bit(solver):
-    _, start = make_start(num_cameras=20, num_points=400, models=("OPENCV", "PINHOLE"))
-    options = AdjustmentOptions(linear_solver=solver, free_focal_lengths=True, max_iterations=8)
-    one = adjust(start, options)
-    several = adjust(start, replace(options, threads=3))
-    np.testing.assert_array_equal(several.problem.centers, one.problem.centers)
-    np.testing.assert_array_equal(several.problem.points, one.problem.points)
-    np.testing.assert_array_equal(several.costs, one.costs)
+    """Enough cameras for strips of a dense factor, and observations for several chunks of points."""
+    _, start = make_start(num_cameras=48, num_points=400, models=("OPENCV", "PINHOLE"))
+    options = AdjustmentOptions(linear_solver=solver, free_focal_lengths=True, max_iterations=4)
+    found = [adjust(start, options, threads=threads) for threads in (1, 2, 3, 7)]
+    known = [
+        (one.costs, one.problem.centers, one.problem.points, known.centers, known.rotations)
+        for one, threads in zip(found, (1, 2, 3, 7), strict=True)
+        for known in [estimate_covariances(one.problem, options, threads=threads)]
+    ]
+    for other in known[1:]:
+        for expected, array in zip(known[0], other, strict=True):
+            np.testing.assert_array_equal(array, expected)
 
 
 def test_the_order_of_observations_matters_to_rounding_only():
