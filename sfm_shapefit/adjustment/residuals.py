@@ -166,9 +166,12 @@ def _views(
     )
 
 
-def chunks_of(layout: Layout) -> list[tuple[int, int]]:
-    """Cut the points into ranges of about equally many observations, some perhaps empty; 1, 2, 4, ..."""
-    least = max(_OBSERVATIONS, _OBSERVATIONS_OF_A_NODE * layout.num_nodes)
+def chunks_of(layout: Layout, of_a_node: int = _OBSERVATIONS_OF_A_NODE) -> list[tuple[int, int]]:
+    """Cut the points into ranges of about equally many observations, some perhaps empty; 1, 2, 4, ...
+
+    Each range has so many observations for every node, as it has sums of all of them.
+    """
+    least = max(_OBSERVATIONS, of_a_node * layout.num_nodes)
     count = min(_MOST_CHUNKS, 1 << max((len(layout.camera) // least).bit_length() - 1, 0))
     return even_ranges(layout.first_observation, count)
 
