@@ -269,7 +269,7 @@ def _entries(
     The nodes (3, c) are those of each camera's frame, lens and sensor, `camera` that of each observation.
     """
     first_entry = np.zeros(len(first_observation), np.int64)
-    where = np.empty((3, len(camera)), np.int64)
+    where = np.full((3, len(camera)), -1)  # as it stays where there is no entry
 
     def work(out: IntArray) -> None:
         def of_points(begin: int, end: int) -> None:

@@ -205,13 +205,14 @@ class _Pulls:
         by_node = [(layout.num_nodes, SLOTS, count) for count in (num_groups, fields.shape[3])]
 
         def job(begin: int, end: int) -> tuple[FloatArray, ...]:
-            sums = tuple(np.zeros(shape) for shape in (*by_node, (square, square)))
+            groups, columns = (np.zeros(shape) for shape in by_node)
+            squares = np.zeros((square, square))
             _pull(
                 begin, end, self.given, layout.frame_of_camera, layout.node_of_frame,
                 self.system.inverses, self.groups, self.windows, fields, turns,
-                *sums, 6 if layout.turns else 3,
+                groups, columns, squares, 6 if layout.turns else 3,
             )  # fmt: skip
-            return sums
+            return groups, columns, squares
 
         chunks = chunks_of(layout, _OBSERVATIONS_OF_A_NODE)
         return self.workers.total([partial(job, *chunk) for chunk in chunks])
