@@ -8,7 +8,8 @@ import pycolmap
 
 from sfm_shapefit.adjustment import bundle_adjustment
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
+from sfm_shapefit.adjustment.freedom import Freedom
+from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.files.colmap.images import images_of, put_images
@@ -121,7 +122,7 @@ def bundle_adjusted(seed, tracks, options=None, freedom=None):
     links, freedom = links_of(seed, tracks), freedom or Freedom()
     options = options or StructureOptions()
     images = posed_images(seed)
-    estimate, points = bundle_adjustment.adjust_seed(images, links, options, freedom, GivenPoses())
+    estimate, points = bundle_adjustment.adjust_seed(begin(images, links, options, freedom))
     found = placed(seed, estimate)
     structure = with_points(found.reconstruction, points, options)
     if isinstance(tracks, pycolmap.Reconstruction):
@@ -132,9 +133,8 @@ def bundle_adjusted(seed, tracks, options=None, freedom=None):
 def adjusted_thinly(seed, tracks, **freedom):
     """`freedom`: fields of `Freedom`."""
     free, links, images = Freedom(**freedom), links_of(seed, tracks), posed_images(seed)
-    found = bundle_adjustment.adjust_thinly(
-        images, lambda: links, StructureOptions(), free, lenses_wanted=True
-    )
+    run = begin(images, links, StructureOptions(), free)
+    found = bundle_adjustment.adjust_thinly(run, lenses_wanted=True)
     return placed(seed, found)
 
 
@@ -142,4 +142,4 @@ def adjusted_placement(seed, tracks, **freedom):
     """`freedom`: fields of `Freedom`; the matches decide about rotations."""
     free, links = Freedom(pull_rad=None, **freedom), links_of(seed, tracks)
     options, images = StructureOptions(), posed_images(seed)
-    return placed(seed, bundle_adjustment.adjust_placement(images, links, options, free, GivenPoses()))
+    return placed(seed, bundle_adjustment.adjust_placement(begin(images, links, options, free)))

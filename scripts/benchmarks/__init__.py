@@ -9,6 +9,7 @@ INDEX = {
     "answers": "What every command answers: recorded, and compared with an earlier recording.",
     "averaging": "Rotation averaging: made graphs against an oracle, real sets beside pycolmap's.",
     "coherent": "Graphs whose wrong pairs agree on one false configuration, up to the theoretical limit.",
+    "cores": "map and locate on 1, 2, 4, ... cores, beside pycolmap's global mapper on as many.",
     "corruption": "View graphs whose pairs are mostly wrong, up to 85 %, by a published generator.",
     "doubt": "Turned cameras and wrong focal lengths on real and bundled scenes: found, and no others.",
     "endtoend": "synth and locate at thousands of images: time by stage, memory and its forecast, exponents.",

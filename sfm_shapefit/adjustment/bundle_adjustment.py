@@ -1,6 +1,5 @@
 """Bundle adjustment of images: from a seed by all points, on few tracks, or after a placement."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -8,27 +7,17 @@ import numpy as np
 
 from sfm_shapefit.adjustment import run as steps
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors, without_unseen_turns
 from sfm_shapefit.adjustment.options import AdjustmentOptions
-from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES
-from sfm_shapefit.adjustment.sources import Links
-from sfm_shapefit.scene.images import Images
+from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES, AdjustmentRun
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import ObservedTracks
-from sfm_shapefit.tracks.options import StructureOptions
 
 _MANY_FRAMES = 1_000  # frames whose poses, if they are fine, need no coarse solve; it is half of the time
 
 
-def adjust_seed(
-    images: Images,
-    links: Links,
-    options: StructureOptions,
-    freedom: Freedom,
-    given: GivenPoses,
-) -> tuple[Estimate, Points]:
-    """Adjust poses, and points that are triangulated from links, from where all `images` are posed.
+def adjust_seed(run: AdjustmentRun) -> tuple[Estimate, Points]:
+    """Adjust poses, and points that are triangulated from links, from where all images are posed.
 
     Returns:
         The images where they stand now, and the points, not filtered yet. The gauge stays that of the start
@@ -38,35 +27,26 @@ def adjust_seed(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run, points, last, initial_error_px = steps.solve_from_seed(
-        steps.begin(images, links, options, freedom, given)
-    )
+    run, points, last, initial_error_px = steps.solve_from_seed(run)
     return run.estimate(last, initial_error_px=initial_error_px), points
 
 
 def adjust_thinly(
-    images: Images,
-    read_links: Callable[[], Links],
-    options: StructureOptions,
-    freedom: Freedom,
-    *,
-    lenses_wanted: bool = False,
-    rotations_known: bool = False,
+    run: AdjustmentRun, *, lenses_wanted: bool = False, rotations_known: bool = False
 ) -> Estimate:
     """Adjust the poses of images on few tracks that hold every camera; for poses that may be coarse.
 
     Twice: the wide limit that coarse poses need lets wrong matches in, which bend what is held loosely, as
     long rings are. A ring of 300 images ends 0.0020 off after the first solve, 0.0012 after the second.
 
+    Observations may miss by four times their limit. A lens whose focal length the points leave open gets what
+    was given back, and the poses are adjusted again. Lenses that an adjustment has found before are held in
+    the first solve. Where a lens or a rig has changed, all points follow, up to 2,000 frames: a shape bends
+    with a focal length that few points leave a thousandth off.
+
     Args:
-        images: the start, all of them posed.
-        read_links: returns the links of these images. Nobody else holds them, so that matches are given back
-            before the last solve, which takes most memory.
-        options: filters. Observations may miss by four times their limit.
-        freedom: what moves. A lens whose focal length the points leave open gets what was given back, and the
-            poses are adjusted again. Lenses that an adjustment has found before are held in the first solve.
-            Where a lens or a rig has changed, all points follow, up to 2,000 frames: a shape bends with a
-            focal length that few points leave a thousandth off.
+        run: at its begin. Nobody else holds its links, so that matches are given back before the last solve,
+            which takes most memory.
         lenses_wanted: whether the images are measured anew through the lenses that come out. Few points
             suffice then, and how well centers are known stays open.
         rotations_known: whether rotations are known from elsewhere. All points follow the first solve at
@@ -78,7 +58,7 @@ def adjust_thinly(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run = steps.begin(images, read_links(), options, freedom, GivenPoses())
+    images = run.images
     only_lenses = lenses_wanted and not rotations_known
     if run.frees_more_than_poses:
         by_all = not only_lenses and len(images.frames.ids) <= MOST_FRAMES
@@ -104,28 +84,23 @@ def adjust_thinly(
     return run.estimate(last, judged=not only_lenses)
 
 
-def adjust_placement(
-    images: Images,
-    links: Links,
-    options: StructureOptions,
-    freedom: Freedom,
-    given: GivenPoses,
-) -> Estimate:
+def adjust_placement(run: AdjustmentRun) -> Estimate:
     """Adjust images, all of them posed, whose rotations were given, on all tracks at once.
 
     Rotations move as the matches decide, if they are to. UnsolvableError if no point can be triangulated.
     """
-    run, errors = steps.begin(images, links, options, replace(freedom, pull_rad=np.inf), given), None
+    images, links, pull_rad, errors = run.images, run.links, run.freedom.pull_rad, None
+    run = replace(run, freedom=replace(run.freedom, pull_rad=np.inf))
     if run.frees_more_than_poses:  # points are found, and rotations judged, with what comes out
         solve, again = steps.solve_twice_thinly, steps.solve_thinly_again
         run, _ = steps.repeat_with_known_lenses(run, solve, again)
         run = run.moved(run.images.posed(images.frames.rotations, run.images.frames.centers))
     tracks, found, problem = run.problem_of_all(checked=True)
-    decided = replace(run.freedom, pull_rad=freedom.pull_rad)
-    if freedom.pull_rad is None:
+    decided = replace(run.freedom, pull_rad=pull_rad)
+    if pull_rad is None:
         # The loss of the adjustment itself: a wider one lets wrong matches hide what the right ones say.
-        loss_scale_px = run.choose_scale(problem) * options.max_reprojection_error_px
-        loss = AdjustmentOptions(loss_scale_px=loss_scale_px)
+        loss_scale_px = run.choose_scale(problem) * run.options.max_reprojection_error_px
+        loss = AdjustmentOptions(loss_scale_px=loss_scale_px, threads=run.threads)
         errors = estimate_rotation_errors(problem, loss)
         if isinstance(links, ObservedTracks):
             errors = without_unseen_turns(errors, problem, loss, run.share_of_frames(tracks, found))

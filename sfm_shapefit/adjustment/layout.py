@@ -12,6 +12,7 @@ Where nothing but free sensors tells the scale, the longest of their baselines k
 moves in the plane across it, `sensor_bases` has no third column, and the slot is empty.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,10 +22,12 @@ from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.geometry import normalized, tangent_bases
-from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.scene.lens import NUM_VALUES, PARTS
+from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.laplacian.operators import Workers, group_by
+from sfm_shapefit.scene.lens import NUM_VALUES, PARTS, Lens
 
 SLOTS = 6  # unknowns of a node at most; a frame has six, a lens no more
+_WORTH_A_THREAD = 20_000  # observations or entries; sorting fewer takes no longer than waking a thread
 _LEAST_SHARED = 0.1  # share of a lens's points; those that have less in common would only fill a node
 
 
@@ -116,20 +119,23 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
     frame_of_camera, sensor_of_camera = problem.rig.frame_of_camera, problem.rig.free_sensor_of_camera
     scale_sensor = find_scale_sensor(problem)
     node_of_frame, node_of_lens, node_of_sensor, active, lens_slots = _nodes(problem, options, scale_sensor)
-    order = np.argsort(problem.points_seen, kind="stable")
     point, camera, pixels = problem.points_seen, problem.cameras_seeing, problem.pixels
-    if (point[1:] < point[:-1]).any():  # else they are shared, since all of them are large
+    order = np.arange(len(point))
+    if (point[1:] < point[:-1]).any():  # else the arrays are shared, since all of them are large
+        order = np.argsort(point, kind="stable")
         point, camera, pixels = point[order], camera[order], np.ascontiguousarray(pixels[order])
+    first_observation = np.searchsorted(point, np.arange(problem.num_points + 1))
     frame_node = node_of_frame[frame_of_camera]
     lens_node = node_of_lens[problem.lens_of_camera]
     sensor_node = np.append(node_of_sensor, -1)[sensor_of_camera]
     nodes = np.stack([frame_node, lens_node, sensor_node])
-    keys, where = _entries(point, nodes[:, camera], len(active))
-    entry_point, entry_node = keys // max(len(active), 1), keys % max(len(active), 1)
-    first_entry = np.searchsorted(entry_point, np.arange(problem.num_points + 1))
-    by_node = np.argsort(entry_node, kind="stable")
-    first_of_node = np.searchsorted(entry_node[by_node], np.arange(len(active) + 1))
-    first_pair, seconds = _pairs(first_of_node, by_node, entry_point, entry_node, first_entry)
+    workers = Workers(options.num_threads())
+    first_entry, entry_node, where = _entries(first_observation, camera, nodes, workers)
+    entry_point = np.repeat(np.arange(problem.num_points), np.diff(first_entry))
+    first_of_node, by_node = group_by(entry_node, len(active))
+    structure = (first_of_node, by_node, entry_point, entry_node, first_entry)
+    first_pair, seconds = _pairs(structure, workers)
+    workers.close()
     pairs = np.stack([np.repeat(np.arange(len(active)), np.diff(first_pair)), seconds], axis=1)
     links, links_of_camera = _links(nodes, camera)
     pair_keys = pairs[:, 0] * len(active) + pairs[:, 1]
@@ -141,9 +147,9 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
         scale_sensor=scale_sensor,
         active=active,
         lens_slots=lens_slots,
-        held_of_lens=np.array([lens.row()[NUM_VALUES:] for lens in problem.lenses]).reshape(-1, 9),
+        held_of_lens=held_of(problem.lenses),
         observation=order,
-        first_observation=np.searchsorted(point, np.arange(problem.num_points + 1)),
+        first_observation=first_observation,
         camera=camera,
         pixels=pixels,
         frame_entry=where[0],
@@ -164,6 +170,11 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
         turns=not options.hold_rotations,
         link_pair=np.searchsorted(pair_keys, links[:, 0] * len(active) + links[:, 1]),
     )
+
+
+def held_of(lenses: Sequence[Lens]) -> FloatArray:
+    """Return the numbers of each lens that never change, (l, 9)."""
+    return np.array([lens.row()[NUM_VALUES:] for lens in lenses]).reshape(-1, 9)
 
 
 def find_scale_sensor(problem: AdjustmentProblem) -> int:
@@ -250,13 +261,27 @@ def _pack(problem: AdjustmentProblem, sizes: IntArray) -> tuple[IntArray, IntArr
     return packs, first_slots
 
 
-def _entries(point: IntArray, nodes: IntArray, num_nodes: int) -> tuple[IntArray, IntArray]:
-    """Return sorted entries, as point * N + node, and those of each observation's nodes (3, m)."""
-    has = nodes >= 0
-    keys, inverse = np.unique((point * num_nodes + nodes)[has], return_inverse=True)
-    where = np.full(nodes.shape, -1)
-    where[has] = inverse
-    return keys, where
+def _entries(
+    first_observation: IntArray, camera: IntArray, nodes: IntArray, workers: Workers
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return where the entries of each point begin (k + 1,), their nodes, and those of observations (3, m).
+
+    The nodes (3, c) are those of each camera's frame, lens and sensor, `camera` that of each observation.
+    """
+    first_entry = np.zeros(len(first_observation), np.int64)
+    where = np.full((3, len(camera)), -1)  # as it stays where there is no entry
+
+    def work(out: IntArray) -> None:
+        def of_points(begin: int, end: int) -> None:
+            _enter(begin, end, first_observation, camera, nodes, first_entry, out, where)
+
+        workers.share(first_observation, of_points, _WORTH_A_THREAD)
+
+    work(np.empty(0, np.int64))
+    np.cumsum(first_entry, out=first_entry)
+    entry_node = np.empty(int(first_entry[-1]), np.int64)
+    work(entry_node)
+    return first_entry, entry_node, where
 
 
 def _links(nodes: IntArray, camera: IntArray) -> tuple[IntArray, IntArray]:
@@ -274,51 +299,86 @@ def _links(nodes: IntArray, camera: IntArray) -> tuple[IntArray, IntArray]:
     return links, links_of_camera
 
 
-def _pairs(
-    first_of_node: IntArray,
-    by_node: IntArray,
-    entry_point: IntArray,
-    entry_node: IntArray,
-    first_entry: IntArray,
-) -> tuple[IntArray, IntArray]:
-    """Return the pairs: where those of each node begin, (N + 1,), and their second nodes, ascending."""
-    structure = (first_of_node, by_node, entry_point, entry_node, first_entry)
-    first = np.zeros(len(first_of_node), np.int64)
-    _meet(*structure, first, np.empty(0, np.int64))
+def _pairs(structure: tuple[IntArray, ...], workers: Workers) -> tuple[IntArray, IntArray]:
+    """Return the pairs: where those of each node begin, (N + 1,), and their second nodes, ascending.
+
+    The structure is what a layout has of its entries by node and by point.
+    """
+    first = np.zeros(len(structure[0]), np.int64)
+
+    def work(out: IntArray) -> None:
+        def of_nodes(begin: int, end: int) -> None:
+            _meet(begin, end, structure, first, out)
+
+        workers.share(structure[0], of_nodes, _WORTH_A_THREAD)
+
+    work(np.empty(0, np.int64))
+    np.cumsum(first, out=first)
     seconds = np.empty(int(first[-1]), np.int64)
-    _meet(*structure, first.copy(), seconds)
-    num_nodes = len(first) - 1
-    firsts = np.repeat(np.arange(num_nodes), np.diff(first))
-    return first, np.sort(firsts * num_nodes + seconds) - firsts * num_nodes
+    work(seconds)
+    return first, seconds
 
 
 @kernel
-def _meet(
-    first_of_node: Any,
-    by_node: Any,
-    entry_point: Any,
-    entry_node: Any,
-    first_entry: Any,
-    first: Any,
-    out: Any,
-) -> None:
-    """Count the later nodes that each node meets into first[i + 1], or, if `out` has room, list them."""
-    n = len(first_of_node) - 1
-    mark = np.full(n, -1, np.int64)
-    found = np.empty(n, np.int64)
-    total = 0
-    for i in range(n):
+def _enter(
+    begin: int, end: int, first_observation: Any, camera: Any, nodes: Any, first: Any, out: Any, where: Any
+) -> None:  # fmt: skip
+    """Count the nodes that see each point p into first[p + 1]; or, if `out` has room, list them in order."""
+    longest = 0
+    for p in range(begin, end):
+        longest = max(longest, first_observation[p + 1] - first_observation[p])
+    found = np.empty(3 * longest, np.int64)
+    for p in range(begin, end):
         count = 0
+        for k in range(first_observation[p], first_observation[p + 1]):
+            for kind in range(3):
+                count = _insert(nodes[kind, camera[k]], found, count)
+        if len(out) == 0:
+            first[p + 1] = count
+            continue
+        for q in range(count):
+            out[first[p] + q] = found[q]
+        for k in range(first_observation[p], first_observation[p + 1]):
+            for kind in range(3):
+                at = 0
+                while at < count and found[at] != nodes[kind, camera[k]]:
+                    at += 1
+                where[kind, k] = first[p] + at if at < count else -1
+
+
+@inner_kernel
+def _insert(node: int, found: Any, count: int) -> int:
+    """Insert a node that is not -1 into an ascending list of so many, if it is new; return how many then."""
+    at = count
+    while at > 0 and found[at - 1] > node:
+        at -= 1
+    if node < 0 or (at > 0 and found[at - 1] == node):
+        return count
+    for q in range(count, at, -1):
+        found[q] = found[q - 1]
+    found[at] = node
+    return count + 1
+
+
+@kernel
+def _meet(begin: int, end: int, structure: Any, first: Any, out: Any) -> None:
+    """Count the later nodes that each node i meets into first[i + 1]; or, if `out` has room, list them."""
+    first_of_node, by_node, entry_point, entry_node, first_entry = structure
+    mark = np.full(len(first) - 1, -1, np.int64)
+    for i in range(begin, end):
+        count, last = 0, i
         for q in range(first_of_node[i], first_of_node[i + 1]):
             e = by_node[q]
             for other in range(e + 1, first_entry[entry_point[e] + 1]):
                 j = entry_node[other]
-                if mark[j] != i:
-                    mark[j] = i
-                    found[count] = j
-                    count += 1
-        if len(out) > 0:
-            for q in range(count):
-                out[total + q] = found[q]
-        total += count
-        first[i + 1] = total
+                count += mark[j] != i
+                mark[j] = i
+                last = max(last, j)
+        if len(out) == 0:
+            first[i + 1] = count
+            continue
+        at = first[i]
+        for j in range(i + 1, last + 1):
+            if mark[j] == i:
+                out[at] = j
+                at += 1

@@ -5,7 +5,7 @@ go by their own loss, from a triangulation that weighed otherwise or after a joi
 system of three unknowns here, and would cost whole iterations there: castle-P30 ends in 12 instead of 35.
 """
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from sfm_shapefit.adjustment.projection import (
     observe,
     turn_to_world,
 )
-from sfm_shapefit.adjustment.residuals import CHUNKS, Values, chunks_of, kernel_inputs
+from sfm_shapefit.adjustment.residuals import Values, chunks_of, kernel_inputs
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.losses import CAUCHY, add_cauchy, weighed
@@ -41,13 +41,15 @@ def settle_points(
     No step raises the loss of its point. An observation behind its camera misses by the focal length.
     """
     given = kernel_inputs(layout, values, loss_scale_px)
-    points, sums = values.points.copy() if steps else values.points, np.zeros(CHUNKS)
+    points = values.points.copy() if steps else values.points
 
-    def job(k: int, begin: int, end: int) -> Callable[[], None]:
-        return lambda: _settle(begin, end, given, points, steps, sums[k : k + 1])
+    def job(begin: int, end: int) -> tuple[FloatArray, ...]:
+        cost = np.zeros(1)
+        _settle(begin, end, given, points, steps, cost)
+        return (cost,)
 
-    workers.run([job(k, *chunk) for k, chunk in enumerate(chunks_of(layout))])
-    return points, float(sums.sum())
+    (cost,) = workers.total([partial(job, *chunk) for chunk in chunks_of(layout)])
+    return points, float(cost[0])
 
 
 @kernel

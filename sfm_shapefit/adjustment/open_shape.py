@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.adjustment.covariance import estimate_covariances
-from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
+from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.given_rotations import noise_of
 from sfm_shapefit.adjustment.lens_doubts import excess
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
@@ -40,7 +40,12 @@ _FOCAL_SIGMA = float(np.log(2.0))  # share; a focal length that only a bent shap
 
 
 def estimate_open_shape(
-    images: Images, tracks: ObservedTracks, *, lenses_held: bool = False, rotations_held: bool = False
+    images: Images,
+    tracks: ObservedTracks,
+    *,
+    lenses_held: bool = False,
+    rotations_held: bool = False,
+    threads: int = 0,
 ) -> FloatArray | None:
     """Return what a model's own tracks leave open of its centers, covariances (i, 3, 3) in squared units.
 
@@ -50,6 +55,7 @@ def estimate_open_shape(
         images: all posed, where the model has them.
         tracks: of its points.
         lenses_held, rotations_held: whether these are known from elsewhere.
+        threads: see `AdjustmentOptions`.
     """
     doubted = [_unmeasured(lens) if lens.is_adjustable else lens for lens in images.lenses]
     parts = np.array([[lens.is_adjustable and not lenses_held] * len(PARTS) for lens in images.lenses])
@@ -58,7 +64,7 @@ def estimate_open_shape(
     if len(images.frames.ids) > MOST_FRAMES:
         return None
     try:
-        run = begin(images, tracks, StructureOptions(), freedom, GivenPoses())
+        run = begin(images, tracks, StructureOptions(), freedom, threads=threads)
         tracks, found, problem = run.problem_of_all(checked=True)
         run = replace(run, freedom=replace(run.freedom, noise_px=_noise_px(problem)))
         few = run.thin_problem(tracks, found, times=FINE_TIMES)

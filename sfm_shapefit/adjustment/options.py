@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sfm_shapefit.base.settings import Settings, explained, option
+from sfm_shapefit.base.threads import MAX_THREADS, count_threads
 
 LinearSolver = Literal["auto", "dense", "sparse"]
 
@@ -48,10 +49,12 @@ class AdjustmentOptions(Settings):
     )
     linear_solver: LinearSolver = option(
         "auto",
-        "How the system of the cameras is factored: dense by LAPACK, or sparse in blocks; auto is dense up "
+        "How the system of the cameras is factored: one dense matrix, or sparse in blocks; auto is dense up "
         "to 3,000 unknowns (500 cameras).",
     )
-    threads: int = option(1, "Threads that share the work; the answer is the same whatever their number.")
+    threads: int = option(
+        0, f"Threads to use, at most {MAX_THREADS}, or 0 for one per core. The answer does not depend on it."
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,4 +66,8 @@ class AdjustmentOptions(Settings):
         self.check_range("gradient_tolerance", 0.0, 1.0)
         self.check_range("first_damping", 0.0, 1.0)
         self.check_range("max_iterations", 1)
-        self.check_range("threads", 1, 256)
+        self.check_range("threads", 0, MAX_THREADS)
+
+    def num_threads(self) -> int:
+        """Return the number of threads to use."""
+        return count_threads(self.threads)

@@ -1,4 +1,4 @@
-"""The reduced system factored: dense by LAPACK, or sparse by the block Cholesky of `laplacian`.
+"""The reduced system factored: as one dense matrix, or sparse by the block Cholesky of `laplacian`.
 
 Unknowns that no node has are left out of the dense matrix; in the sparse one they are rows of the identity,
 and blocks are only as large as the largest node (3 where rotations are held).
@@ -8,6 +8,7 @@ answer of 64: half the memory, the largest of an adjustment, and two thirds of t
 on 10,000 images. Where that does not lead there, the factor gets 64 bits, and keeps them.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,18 +22,22 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.base.scipy_parts import dpotrf, dpotri, dpotrs
+from sfm_shapefit.base.scipy_parts import dpotrs
 from sfm_shapefit.laplacian.approximate import conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import (
     PIVOT_TOLERANCE,
     CholeskyFactor,
     allocate_factor,
     analyze,
+    factor_by_strips,
 )
+from sfm_shapefit.laplacian.dense import blas_of, trsm
+from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.laplacian.selected import selected_inverse
 
 _UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"
 _DENSE_LIMIT = 3000  # unknowns: 500 free cameras
+_NODES_AT_ONCE = 32  # nodes whose columns of the inverse are solved for together, as one job of a thread
 # Residual of a solve, relative to its right-hand side, and products that may lead there; a factor of 64 bits
 # takes as long as 25 to 40 of them.
 _RESIDUAL, _MOST_PRODUCTS = 1e-11, 40
@@ -47,7 +52,11 @@ def choose_factor(
     """Return an empty factor as the options ask, dense without unknowns; `dtype` is that of a sparse one."""
     dense_up_to = {"auto": _DENSE_LIMIT, "dense": np.inf, "sparse": 0}[options.linear_solver]
     dense = layout.num_unknowns <= dense_up_to
-    return DenseFactor.plan(layout) if dense else SparseFactor.plan(layout, options.threads, dtype)
+    return (
+        DenseFactor.plan(layout, options.num_threads())
+        if dense
+        else SparseFactor.plan(layout, options.num_threads(), dtype)
+    )
 
 
 @dataclass(slots=True, eq=False)
@@ -60,13 +69,14 @@ class DenseFactor:
     """(P, 2)"""
     matrix: FloatArray
     """(u, u) the system, then its factor; columns contiguous."""
+    workers: Workers
 
     @classmethod
-    def plan(cls, layout: Layout) -> "DenseFactor":
+    def plan(cls, layout: Layout, threads: int) -> "DenseFactor":
         """Number the unknowns."""
         rows = np.where(layout.active, np.cumsum(layout.active).reshape(layout.active.shape) - 1, -1)
         size = layout.num_unknowns
-        return cls(rows, layout.pairs, np.empty((size, size), order="F"))
+        return cls(rows, layout.pairs, np.empty((size, size), order="F"), Workers(threads))
 
     def refactor(self, system: ReducedSystem) -> None:
         """Factor a system; raise UnsolvableError if it is not positive definite to working precision."""
@@ -74,7 +84,8 @@ class DenseFactor:
         _fill(self.rows, self.pair_nodes, system.diagonal, system.pairs, self.matrix.T)
         before = np.diag(self.matrix).copy()
         with one_blas_thread():
-            self.matrix, info = dpotrf(self.matrix, lower=1, clean=0, overwrite_a=1)
+            size, matrix = len(self.matrix), self.matrix
+            info = factor_by_strips((matrix.ctypes.data, size), size, matrix.dtype, self.workers)
         _refuse_singular(bool(info), np.diag(self.matrix) ** 2 / before if not info else before)
 
     def solve(self, right: FloatArray) -> FloatArray:
@@ -89,16 +100,32 @@ class DenseFactor:
     def inverse_blocks(self) -> FloatArray:
         """Return the diagonal blocks of the inverse, (N, 6, 6); 0 for what is no unknown."""
         out = np.zeros((*self.rows.shape, SLOTS))
-        if not (self.rows >= 0).any():
-            return out
+
+        def job(begin: int, end: int) -> Callable[[], object]:
+            return lambda: self._write_inverse(begin, end, out)
+
+        count = len(self.rows)
         with one_blas_thread():
-            inverse, _ = dpotri(self.matrix, lower=1)
-        for node, rows in enumerate(self.rows):
-            slots = np.flatnonzero(rows >= 0)
-            taken = rows[slots]
-            lower = np.tril(inverse[np.ix_(taken, taken)])
-            out[node][np.ix_(slots, slots)] = lower + np.tril(lower, -1).T
+            begins = range(0, count, _NODES_AT_ONCE)
+            self.workers.run([job(begin, min(begin + _NODES_AT_ONCE, count)) for begin in begins])
         return out
+
+    def _write_inverse(self, begin: int, end: int, out: FloatArray) -> None:
+        """Write the blocks of the nodes begin..end-1: products of columns of L^-1, zero above these nodes."""
+        size, slots = len(self.matrix), int((self.rows >= 0).any(axis=0).sum())
+        own = self.rows[begin:end, :slots].ravel()
+        unknown = np.flatnonzero(own >= 0)
+        if not len(unknown):
+            return
+        first = int(own[unknown[0]])
+        columns = np.zeros((size - first, len(own)))  # of L^-1, by rows from the first that is not zero
+        columns[own[unknown] - first, unknown] = 1.0
+        triangle = self.matrix.ctypes.data + first * (size + 1) * self.matrix.itemsize, size
+        shape = len(own), size - first
+        trsm(blas_of(np.float64), triangle, (columns.ctypes.data, len(own)), *shape)
+        by_node = columns.reshape(size - first, end - begin, slots)
+        blocks = by_node.transpose(1, 2, 0) @ by_node.transpose(1, 0, 2)
+        out[begin:end, :slots, :slots] = 0.5 * (blocks + blocks.transpose(0, 2, 1))
 
     def give_back(self) -> None:
         """Keep the matrix, which is small."""

@@ -16,16 +16,17 @@ turn w in axes of the rig makes R exp(w) of R. With J the derivative of the pixe
 -J R and that by w is R^T (x cross J).
 
 Points are cut into the same chunks whatever the number of threads, and the sums of the chunks are added in
-order: the same bits always.
+one order: the same bits always.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment.layout import SLOTS, Layout
+from sfm_shapefit.adjustment.layout import SLOTS, Layout, held_of
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.projection import (
     SHIFT,
     differentiate_by_lens,
@@ -34,13 +35,16 @@ from sfm_shapefit.adjustment.projection import (
     turn_to_frame,
     turn_to_world,
 )
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.losses import weigh_residual
-from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.laplacian.operators import Workers, even_ranges
 from sfm_shapefit.scene.lens import NUM_VALUES
 
-CHUNKS = 4  # parts of the points; each has sums of all nodes of its own, so the bits depend on their number
+# Parts of the points, each with sums of all nodes of its own: as many of 1, 2, 4, ... as leave each of them
+# so many observations, and so many for each node. To make and add sums of a node takes a third of the time of
+# an observation, to hand over a chunk that of a hundred.
+_MOST_CHUNKS, _OBSERVATIONS, _OBSERVATIONS_OF_A_NODE = 32, 2_000, 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -97,9 +101,6 @@ def linearize(
             share.
     """
     num_nodes, num_links = layout.num_nodes, len(layout.links)
-    nodes = np.zeros((CHUNKS, num_nodes, SLOTS, SLOTS))
-    gradients = np.zeros((CHUNKS, num_nodes, SLOTS))
-    links = np.zeros((CHUNKS, num_links, SLOTS, SLOTS))
     points = np.empty((layout.num_points, 6))
     point_gradients = np.empty((layout.num_points, 3))
     entries = np.empty((len(layout.entry_node), 3, SLOTS))
@@ -112,68 +113,79 @@ def linearize(
     )  # fmt: skip
     by_point_sums = (points, point_gradients, entries)
 
-    def job(k: int, begin: int, end: int) -> Callable[[], None]:
-        sums = (nodes[k], gradients[k], links[k])
-        return lambda: _linearize(begin, end, given, structure, sums, by_point_sums)
+    def job(begin: int, end: int) -> tuple[FloatArray, ...]:
+        shapes = (num_nodes, SLOTS, SLOTS), (num_nodes, SLOTS), (num_links, SLOTS, SLOTS)
+        sums = tuple(np.zeros(shape) for shape in shapes)
+        _linearize(begin, end, given, structure, sums, by_point_sums)
+        return sums
 
-    workers.run([job(k, *chunk) for k, chunk in enumerate(chunks_of(layout))])
-    upper = nodes.sum(axis=0)
+    upper, gradients, links = workers.total([partial(job, *chunk) for chunk in chunks_of(layout)])
     return NormalEquations(
         nodes=upper + np.triu(upper, 1).transpose(0, 2, 1),
-        node_gradients=gradients.sum(axis=0),
-        links=links.sum(axis=0),
+        node_gradients=gradients,
+        links=links,
         points=points,
         point_gradients=point_gradients,
         entries=entries,
     )
 
 
-def reprojection_residuals(layout: Layout, values: Values) -> FloatArray:
-    """Return the residuals (m, 2) in pixels, in the problem's order; NaN behind the camera."""
-    residuals = np.empty((len(layout.camera), 2))
-    _write_residuals(kernel_inputs(layout, values, None), residuals)
-    ordered = np.empty_like(residuals)
-    ordered[layout.observation] = residuals
-    return ordered
+def reprojection_residuals(problem: AdjustmentProblem, values: Values) -> FloatArray:
+    """Return the residuals (m, 2) in pixels; NaN behind the camera."""
+    residuals = np.empty((problem.num_observations, 2))
+    held = held_of(problem.lenses)
+    views = _views(problem.rig.frame_of_camera, problem.lens_of_camera, held, values)
+    _write_residuals(
+        problem.points_seen, problem.cameras_seeing, problem.pixels, views, values.points, residuals
+    )
+    return residuals
 
 
 def kernel_inputs(layout: Layout, values: Values, loss_scale_px: float | None) -> tuple[Any, ...]:
     """Return what every kernel here reads."""
-    turned = values.sensor_rotations @ values.rotations[layout.frame_of_camera]
-    views = np.concatenate(
-        [
-            turned.reshape(-1, 9),
-            values.centers[layout.frame_of_camera],
-            values.sensor_translations,
-            values.sensor_rotations.reshape(-1, 9),
-            values.lenses[layout.lens_of_camera],
-            layout.held_of_lens[layout.lens_of_camera],
-        ],
-        axis=1,
-    )
+    views = _views(layout.frame_of_camera, layout.lens_of_camera, layout.held_of_lens, values)
     scale = np.inf if loss_scale_px is None else loss_scale_px**2
     return layout.first_observation, layout.camera, layout.pixels, views, values.points, scale
 
 
-def chunks_of(layout: Layout) -> list[tuple[int, int]]:
-    """Cut the points into ranges of about equally many observations, some perhaps empty."""
-    wanted = np.arange(1, CHUNKS) * (len(layout.camera) / CHUNKS)
-    cuts = np.searchsorted(layout.first_observation, wanted).tolist()
-    return list(zip([0, *cuts], [*cuts, layout.num_points], strict=True))
+def _views(
+    frame_of_camera: IntArray, lens_of_camera: IntArray, held_of_lens: FloatArray, values: Values
+) -> FloatArray:
+    """Return what kernels read of each camera, a row of `projection`."""
+    turned = values.sensor_rotations @ values.rotations[frame_of_camera]
+    return np.concatenate(
+        [
+            turned.reshape(-1, 9),
+            values.centers[frame_of_camera],
+            values.sensor_translations,
+            values.sensor_rotations.reshape(-1, 9),
+            values.lenses[lens_of_camera],
+            held_of_lens[lens_of_camera],
+        ],
+        axis=1,
+    )
+
+
+def chunks_of(layout: Layout, of_a_node: int = _OBSERVATIONS_OF_A_NODE) -> list[tuple[int, int]]:
+    """Cut the points into ranges of about equally many observations, some perhaps empty; 1, 2, 4, ...
+
+    Each range has so many observations for every node, as it has sums of all of them.
+    """
+    least = max(_OBSERVATIONS, of_a_node * layout.num_nodes)
+    count = min(_MOST_CHUNKS, 1 << max((len(layout.camera) // least).bit_length() - 1, 0))
+    return even_ranges(layout.first_observation, count)
 
 
 @kernel
-def _write_residuals(given: Any, out: Any) -> None:
-    """Write the residuals in the order of the points; NaN behind the camera."""
-    first, cameras, pixels, views, points, _ = given
-    for p in range(len(first) - 1):
-        for k in range(first[p], first[p + 1]):
-            camera = cameras[k]
-            x, y, z = look(views, camera, points, p)
-            x, y, z = x + views[camera, SHIFT], y + views[camera, SHIFT + 1], z + views[camera, SHIFT + 2]
-            ray = (x / z, y / z, 1.0 / z)
-            ahead, rx, ry, _, _, _, _, _, _ = observe(views, camera, (x, y, z), ray, pixels, k)
-            out[k, 0], out[k, 1] = (rx, ry) if ahead else (np.nan, np.nan)
+def _write_residuals(points_seen: Any, cameras: Any, pixels: Any, views: Any, points: Any, out: Any) -> None:
+    """Write the residual of each observation; NaN behind the camera."""
+    for k in range(len(out)):
+        camera = cameras[k]
+        x, y, z = look(views, camera, points, points_seen[k])
+        x, y, z = x + views[camera, SHIFT], y + views[camera, SHIFT + 1], z + views[camera, SHIFT + 2]
+        ray = (x / z, y / z, 1.0 / z)
+        ahead, rx, ry, _, _, _, _, _, _ = observe(views, camera, (x, y, z), ray, pixels, k)
+        out[k, 0], out[k, 1] = (rx, ry) if ahead else (np.nan, np.nan)
 
 
 @kernel

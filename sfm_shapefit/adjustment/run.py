@@ -22,8 +22,6 @@ fifths of all observations are of no longer tracks, and each such match constrai
 on castle-P19 (mean error 0.0254 without, 0.0238 with them), Herz-Jesus-P8 (0.0036, both) and a rendered
 street (0.0116, 0.0114). From rotations that were given (`adjust_placement`) a first solve may be far off,
 and takes checked points alone.
-
-One thread does all, as the answer must not depend on their number.
 """
 
 import math
@@ -101,6 +99,8 @@ class AdjustmentRun:
     freedom: Freedom
     """Lenses that the observations leave open are held from then on."""
     given: GivenPoses
+    threads: int
+    """Threads of each solve, see `AdjustmentOptions`."""
     checked_length: int
     """Fewest observations of a point that a model may have."""
     focal_sigmas: FloatArray
@@ -221,6 +221,7 @@ class AdjustmentRun:
             loss_scale_px=self.loss_scale_px,
             hold_rotations=self.freedom.holds_rotations,
             noise_px=self.freedom.noise_px,
+            threads=self.threads,
         )
 
     def moved(self, images: Images) -> "AdjustmentRun":
@@ -342,9 +343,24 @@ def _without_lone_frames(found: TriangulatedPoints, frames: IntArray, least: int
 
 
 def begin(
-    images: Images, links: Links, options: StructureOptions, freedom: Freedom, given: GivenPoses
+    images: Images,
+    links: Links,
+    options: StructureOptions,
+    freedom: Freedom,
+    given: GivenPoses | None = None,
+    threads: int = 0,
 ) -> AdjustmentRun:
-    """Return the run of an adjustment that is to begin."""
+    """Return the run of an adjustment that is to begin.
+
+    Args:
+        images: the start, all of them posed.
+        links: of these images.
+        options: filters of points.
+        freedom: what moves.
+        given: what is known of their poses; nothing if None.
+        threads: see `AdjustmentOptions`.
+    """
+    given = given or GivenPoses()
     fewest = options.fewest_views(images.num_images) if isinstance(links, MatchedKeypoints) else 2
     num_lenses = len(images.lenses)
     return AdjustmentRun(
@@ -353,6 +369,7 @@ def begin(
         options=options,
         freedom=freedom.over(num_lenses),
         given=given if given.rotations is not None else given._replace(rotations=images.frames.rotations),
+        threads=threads,
         checked_length=max(options.min_track_length, fewest),
         focal_sigmas=np.full(num_lenses, np.nan),
         undetermined=np.zeros(num_lenses, dtype=np.bool_),
@@ -490,6 +507,17 @@ def solve_by_all_points(
     run, last = run.solve(problem, LAST_FALL, first_damping=_NEAR_DAMPING, settles_points=True)
     found = replace(found, points=last.points).of_length(run.checked_length)
     return run, views_of(run.images).seen_points(joined, found), last
+
+
+def solve_known_points(run: AdjustmentRun, points: FloatArray) -> Solved:
+    """Return the run after two solves by points (k, 3) that are there, one for each track of its links.
+
+    No other is triangulated, and none is left out. InputError if no image observes a point.
+    """
+    assert isinstance(run.links, ObservedTracks)
+    problem = run.problem(run.links, TriangulatedPoints.of_tracks(run.links, points))
+    run, problem = run.solve(problem, FIRST_FALL, settles_points=True)
+    return run.solve(problem, LAST_FALL, first_damping=_NEAR_DAMPING, settles_points=True)
 
 
 def solve_from_seed(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem, float]:

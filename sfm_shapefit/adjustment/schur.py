@@ -9,7 +9,6 @@ and says nothing of its cameras that it should not. An unknown on which nothing 
 camera without observations, is held too: its diagonal entry becomes 1.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +20,8 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.jit import kernel, subtract_block
 from sfm_shapefit.laplacian.operators import Workers
 
-_JOBS = 16  # ranges of nodes or points; a row is summed by one of them, so that their number does not matter
+_ENTRIES_WORTH_A_THREAD = 1_000  # each meets all others of its point
+_ENTRIES_OF_POINTS_WORTH_A_THREAD = 50_000  # each is multiplied by a step
 _SINGULAR = 1e-12  # least pivot of a point's block, relative to its diagonal: a parallax of 1e-6 rad
 
 
@@ -53,28 +53,34 @@ def eliminate_points(
     pairs = np.zeros((len(layout.pairs), SLOTS, SLOTS))
     pairs[layout.link_pair] = normal.links
 
-    def job(begin: int, end: int) -> Callable[[], None]:
-        return lambda: _reduce(
+    def work(begin: int, end: int) -> None:
+        _reduce(
             begin, end, layout.first_of_node, layout.entries_by_node, layout.entry_point, layout.entry_node,
             layout.first_entry, layout.first_pair, layout.pairs, normal.entries, inverses,
             normal.point_gradients, diagonal, pairs, right,
         )  # fmt: skip
 
-    wanted = np.arange(1, _JOBS) * (len(layout.entry_node) / _JOBS)
-    cuts = np.searchsorted(layout.first_of_node, wanted).clip(max=layout.num_nodes).tolist()
-    workers.run([job(*both) for both in zip([0, *cuts], [*cuts, layout.num_nodes], strict=True)])
+    workers.share(layout.first_of_node, work, _ENTRIES_WORTH_A_THREAD)
     return ReducedSystem(diagonal=diagonal, pairs=pairs, right=right, inverses=inverses)
 
 
 def step_points(
-    layout: Layout, normal: NormalEquations, inverses: FloatArray, node_steps: FloatArray
+    layout: Layout,
+    normal: NormalEquations,
+    inverses: FloatArray,
+    node_steps: FloatArray,
+    workers: Workers,
 ) -> FloatArray:
     """Return the steps of the points (k, 3) that belong to steps of the nodes (N, 6)."""
     steps = np.empty_like(normal.point_gradients)
-    _back_substitute(
-        layout.first_entry, layout.entry_node, normal.entries, inverses, normal.point_gradients, node_steps,
-        steps,
-    )  # fmt: skip
+
+    def work(begin: int, end: int) -> None:
+        _back_substitute(
+            begin, end, layout.first_entry, layout.entry_node, normal.entries, inverses,
+            normal.point_gradients, node_steps, steps,
+        )  # fmt: skip
+
+    workers.share(layout.first_entry, work, _ENTRIES_OF_POINTS_WORTH_A_THREAD)
     return steps
 
 
@@ -134,6 +140,8 @@ def _reduce(
 
 @kernel
 def _back_substitute(
+    begin: int,
+    end: int,
     first_entry: Any,
     entry_node: Any,
     entries: Any,
@@ -142,8 +150,8 @@ def _back_substitute(
     node_steps: Any,
     steps: Any,
 ) -> None:
-    """Write -V^-1 (b + sum W d) for each point."""
-    for p in range(len(inverses)):
+    """Write -V^-1 (b + sum W d) for the points begin..end-1."""
+    for p in range(begin, end):
         x, y, z = gradients[p, 0], gradients[p, 1], gradients[p, 2]
         for e in range(first_entry[p], first_entry[p + 1]):
             step = node_steps[entry_node[e]]

@@ -32,6 +32,7 @@ nothing holds these (`covariance`).
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,12 +48,13 @@ from sfm_shapefit.adjustment.projection import (
     turn_to_frame,
     turn_to_world,
 )
-from sfm_shapefit.adjustment.residuals import kernel_inputs
+from sfm_shapefit.adjustment.residuals import chunks_of, kernel_inputs
 from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import METRIC_SIGMA
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.losses import CAUCHY, weighed
+from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.lens import LensErrors
 
 _MOST_GROUPS = 64  # groups of neighboring points; each is one more right side for the factor
@@ -61,6 +63,8 @@ _DEGREE = 3  # degree of the polynomials of a smooth field; ten coefficients for
 _NUM_FIELDS = (_DEGREE + 1) * (_DEGREE + 2) // 2
 # Draws of smooth fields and turns; a variance from as many has a standard deviation of (2 / 24)^1/2 = 29 %.
 _SAMPLES = 24
+# Observations of a chunk for each node: its sums, which are made and added, are large here.
+_OBSERVATIONS_OF_A_NODE = 64
 # Smooth field of a doubted lens, in median errors; between what two sets with truth call for, see the header.
 _CALIBRATION_OF_ERROR = 0.45
 _VISIBLE = 0.05  # share of a field's energy left in the residuals; a field of less cannot be read off them
@@ -177,10 +181,11 @@ class _Pulls:
         self.given = kernel_inputs(system.layout, values_of(problem), options.loss_scale_px)
         self.windows = _windows(problem)
         self.groups = _group_neighbors(problem.points)
+        self.workers = Workers(options.num_threads())
 
     def draw(
         self, calibration_px: float, lens_errors_px: FloatArray, turn_sigmas_rad: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, ...]:
         """Return the pulls of each group's residuals (N, 6, g), and of samples of smooth errors (N, 6, s)."""
         rng = np.random.default_rng(0)
         problem, fields_of_one = self.problem, (2, _NUM_FIELDS, _SAMPLES)
@@ -188,27 +193,29 @@ class _Pulls:
         turns = turn_sigmas_rad[:, None, None] * rng.standard_normal((problem.num_frames, 3, _SAMPLES))
         shared = rng.standard_normal((len(problem.lenses), *fields_of_one))
         fields += (lens_errors_px[:, None, None, None] * shared)[problem.lens_of_camera]
-        num_groups = int(self.groups.max(initial=0)) + 1
-        by_group = np.zeros((self.system.layout.num_nodes, SLOTS, num_groups))
-        by_sample, _ = self.pull(fields, turns, by_group)
-        return by_group, by_sample
+        return self.pull(fields, turns)[:2]
 
-    def pull(
-        self, fields: FloatArray, turns: FloatArray, by_group: FloatArray, square: int = 0
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the pulls (N, 6, s) of fields (c, 2, t, s) and turns (n, 3, s), and, if wanted, squares.
+    def pull(self, fields: FloatArray, turns: FloatArray, square: int = 0) -> tuple[FloatArray, ...]:
+        """Return what residuals of groups, and fields (c, 2, t, s) and turns (n, 3, s), pull at the nodes.
 
-        The squares are the products of fields and residuals among one another as the points leave them.
+        By each group (N, 6, g), by each field (N, 6, s), and, if wanted, squares: the products of fields and
+        residuals among one another as the points leave them.
         """
-        layout, count = self.system.layout, fields.shape[3]
-        by_field = np.zeros((layout.num_nodes, SLOTS, count))
-        squares = np.zeros((square, square))
-        _pull(
-            self.given, layout.frame_of_camera, layout.node_of_frame,
-            self.system.inverses, self.groups, self.windows, fields, turns,
-            by_group, by_field, squares, 6 if layout.turns else 3,
-        )  # fmt: skip
-        return by_field, squares
+        layout, num_groups = self.system.layout, int(self.groups.max(initial=0)) + 1
+        by_node = [(layout.num_nodes, SLOTS, count) for count in (num_groups, fields.shape[3])]
+
+        def job(begin: int, end: int) -> tuple[FloatArray, ...]:
+            groups, columns = (np.zeros(shape) for shape in by_node)
+            squares = np.zeros((square, square))
+            _pull(
+                begin, end, self.given, layout.frame_of_camera, layout.node_of_frame,
+                self.system.inverses, self.groups, self.windows, fields, turns,
+                groups, columns, squares, 6 if layout.turns else 3,
+            )  # fmt: skip
+            return groups, columns, squares
+
+        chunks = chunks_of(layout, _OBSERVATIONS_OF_A_NODE)
+        return self.workers.total([partial(job, *chunk) for chunk in chunks])
 
     def detect_lens_errors(self, noise2: float) -> tuple[float, FloatArray]:
         """Return the score of fields of the lenses beyond noise of `noise2` px^2, and the size of each (l,).
@@ -231,8 +238,7 @@ class _Pulls:
         unit = np.eye(count).reshape(2, _NUM_FIELDS, count)
         fields = np.where(own[:, None, None, None], unit, 0.0)
         turns = np.zeros((self.problem.num_frames, 3, count))
-        by_group = np.zeros((self.system.layout.num_nodes, SLOTS, int(self.groups.max(initial=0)) + 1))
-        pulls, squares = self.pull(fields, turns, by_group, count + 1)
+        by_group, pulls, squares = self.pull(fields, turns, count + 1)
         # What the residuals still want of the frames is not the lens's.
         pulls = np.concatenate([pulls, by_group.sum(axis=2, keepdims=True)], axis=2)
         explained = np.einsum("nak,naj->kj", pulls[:, :, :count], self.system.solve(pulls, gauge=False))
@@ -312,27 +318,27 @@ def _group_neighbors(points: FloatArray) -> IntArray:
 
 @kernel
 def _pull(
-    given: Any, frame_of_camera: Any, node_of_frame: Any,
+    begin: int, end: int, given: Any, frame_of_camera: Any, node_of_frame: Any,
     inverses: Any, groups: Any, windows: Any, fields: Any, turns: Any,
     by_group: Any, by_field: Any, squares: Any, slots: int,
 ) -> None:  # fmt: skip
-    """Add what fields, turns and residuals pull at the nodes, the points following.
+    """Add what fields, turns and residuals of the points begin..end-1 pull at the nodes, these following.
 
     Column s of `fields` and `turns` goes to column s of `by_field`, the residuals of a point to the column of
-    its group in `by_group`, if there is any; residuals are the last row and column of `squares`.
+    its group in `by_group`; residuals are the last row and column of `squares`.
     """
     first, cameras, pixels, views, points, scale = given
     count = fields.shape[3]
-    has_groups, has_squares = by_group.shape[2] > 0, len(squares) > 0
+    has_squares = len(squares) > 0
     longest = 0
-    for p in range(len(first) - 1):
+    for p in range(begin, end):
         longest = max(longest, first[p + 1] - first[p])
     residual = np.empty(2)
     by_points, by_frames = np.empty((longest, 2, 3)), np.zeros((longest, 2, 6))
     errors, weights = np.empty((longest, 2, count + 1)), np.empty(longest)
     basis, p_x, p_y = np.empty(_NUM_FIELDS), np.ones(_DEGREE + 1), np.ones(_DEGREE + 1)
     sums, along, left = np.empty((3, count + 1)), np.empty(3), np.empty((2, count + 1))
-    for p in range(len(first) - 1):
+    for p in range(begin, end):
         sums[:] = 0.0
         for k in range(first[p], first[p + 1]):
             at, camera = k - first[p], cameras[k]
@@ -396,8 +402,7 @@ def _pull(
                 by_x, by_y = by_frames[at, 0, a], by_frames[at, 1, a]
                 for s in range(count):
                     by_field[node, a, s] += w * (by_x * x_left[s] + by_y * y_left[s])
-                if has_groups:
-                    by_group[node, a, groups[p]] += w * (by_x * x_left[count] + by_y * y_left[count])
+                by_group[node, a, groups[p]] += w * (by_x * x_left[count] + by_y * y_left[count])
 
 
 @inner_kernel

@@ -148,8 +148,7 @@ def adjust(
 
 def reprojection_errors_px(problem: AdjustmentProblem) -> FloatArray:
     """Return how far each observation misses its pixel, (m,); NaN if its point is behind the camera."""
-    layout = lay_out(problem, AdjustmentOptions())
-    return np.asarray(np.linalg.norm(reprojection_residuals(layout, values_of(problem)), axis=1))
+    return np.asarray(np.linalg.norm(reprojection_residuals(problem, values_of(problem)), axis=1))
 
 
 def frames_not_gained(before: AdjustmentProblem, after: AdjustmentProblem, loss_scale_px: float) -> BoolArray:
@@ -235,7 +234,7 @@ class _Run:
 
     def __init__(self, problem: AdjustmentProblem, options: AdjustmentOptions) -> None:
         self.problem, self.options = problem, options
-        self.workers = Workers(options.threads)
+        self.workers = Workers(options.num_threads())
         self.layout = lay_out(problem, options)
         hand_back_memory()  # what the layout was made of goes before the largest arrays come
         self.factor: ReducedFactor = choose_factor(self.layout, options, np.float32)
@@ -331,7 +330,7 @@ class _Run:
             normal.entries = self.linearize().entries
         if steps is None:
             return None
-        point_steps = step_points(layout, normal, inverses, steps)
+        point_steps = step_points(layout, normal, inverses, steps, self.workers)
         diagonal = np.einsum("naa->na", normal.nodes)
         damped = float(np.sum(diagonal * steps**2) + np.sum(normal.points[:, [0, 3, 5]] * point_steps**2))
         slope = float(np.sum(normal.node_gradients * steps) + np.sum(normal.point_gradients * point_steps))

@@ -48,5 +48,4 @@ _special = _functions("scipy.special", "_ufuncs", "scipy.special")
 _lapack = _functions("scipy.linalg", "_flapack", "scipy.linalg.lapack")
 
 expit, logit, gammaln, chdtri = _special.expit, _special.logit, _special.gammaln, _special.chdtri
-dpotrf, dpotri, dpotrs, dtrtri = _lapack.dpotrf, _lapack.dpotri, _lapack.dpotrs, _lapack.dtrtri
-dgeqp3 = _lapack.dgeqp3
+dpotrs, dgeqp3 = _lapack.dpotrs, _lapack.dgeqp3

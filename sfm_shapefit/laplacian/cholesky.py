@@ -311,46 +311,58 @@ def _factor_above(
 
 
 def _factor_large(factor: CholeskyFactor, stack: npt.NDArray[Any], s: int, pivot: Any) -> bool:
-    """Factor one assembled front by strips of columns, each strip's update of the rest as parallel jobs."""
-    plan, b, workers = factor.symbolic, factor.block, factor.workers
+    """Factor one assembled front by strips of columns, and write its update, in parallel jobs."""
+    plan, b, workers, dtype = factor.symbolic, factor.block, factor.workers, factor.dtype
     width = int(plan.first[s + 1] - plan.first[s]) * b
     height = width + int(plan.row_pointers[s + 1] - plan.row_pointers[s]) * b
     below, size = height - width, factor.panels.itemsize
     panel = factor.panels.ctypes.data + int(plan.panel_pointers[s]) * b * b * size
     update = stack.ctypes.data + int(plan.update_offsets[s]) * b * b * size
-
-    def block(row: int, column: int) -> Block:
-        return panel + (column * height + row) * size, height
+    info = factor_by_strips((panel, height), width, dtype, workers)
+    if info != 0:
+        pivot[:] = 0.0, plan.first[s] * b + info - 1
+        return True
 
     def waiting(row: int, column: int) -> Block:
         return update + (column * below + row) * size, below
 
-    def divide(j: int, end: int, row: int) -> Callable[[], object]:
-        rows = min(_STRIP, height - row)
-        return lambda: trsm(blas_of(factor.dtype), block(j, j), block(row, j), rows, end - j)
-
-    def subtract(j: int, end: int, row: int) -> Callable[[], object]:
-        rows = row, min(row + _STRIP, width), height
-        return lambda: _subtract_strip(
-            blas_of(factor.dtype), lambda i: block(i, j), end - j, block, rows, True
-        )
-
     def leave(row: int) -> Callable[[], object]:
         rows = row, min(row + _STRIP, below), below
         return lambda: _subtract_strip(
-            blas_of(factor.dtype), lambda i: block(width + i, 0), width, waiting, rows, False
+            blas_of(dtype), lambda i: (panel + (width + i) * size, height), width, waiting, rows, False
         )
+
+    workers.run([leave(row) for row in range(0, below, _STRIP)])
+    return False
+
+
+def factor_by_strips(panel: Block, width: int, dtype: np.dtype[Any], workers: Workers) -> int:
+    """Factor the first `width` columns of a panel, its square part on top, in place.
+
+    Returns 0, or k if the leading minor of order k is not positive. Strips of columns are factored one after
+    the other, each one's update of the rest as parallel jobs. The caller holds BLAS to one thread.
+    """
+    (address, height), size = panel, dtype.itemsize
+
+    def block(row: int, column: int) -> Block:
+        return address + (column * height + row) * size, height
+
+    def divide(j: int, end: int, row: int) -> Callable[[], object]:
+        rows = min(_STRIP, height - row)
+        return lambda: trsm(blas_of(dtype), block(j, j), block(row, j), rows, end - j)
+
+    def subtract(j: int, end: int, row: int) -> Callable[[], object]:
+        rows = row, min(row + _STRIP, width), height
+        return lambda: _subtract_strip(blas_of(dtype), lambda i: block(i, j), end - j, block, rows, True)
 
     for j in range(0, width, _STRIP):
         end = min(j + _STRIP, width)
-        info = potrf(blas_of(factor.dtype), block(j, j), end - j)
+        info = potrf(blas_of(dtype), block(j, j), end - j)
         if info != 0:
-            pivot[:] = 0.0, plan.first[s] * b + j + info - 1
-            return True
+            return j + info
         workers.run([divide(j, end, row) for row in range(end, height, _STRIP)])
         workers.run([subtract(j, end, row) for row in range(end, width, _STRIP)])
-    workers.run([leave(row) for row in range(0, below, _STRIP)])
-    return False
+    return 0
 
 
 def _subtract_strip(

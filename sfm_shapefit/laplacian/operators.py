@@ -6,10 +6,12 @@
 `LaplacianOperator` multiplies without a matrix, by row blocks on several threads.
 """
 
+import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,6 +77,18 @@ def group_by(labels: Any, count: int) -> Any:
     return pointers, items
 
 
+def even_ranges(starts: IntArray, count: int) -> list[tuple[int, int]]:
+    """Cut rows 0..n-1 into ranges of about equally many items, some perhaps empty.
+
+    The items of row i are starts[i]..starts[i+1]-1.
+    """
+    cuts = np.searchsorted(starts, np.arange(1, count) * (int(starts[-1]) / count)).tolist()
+    return list(zip([0, *cuts], [*cuts, len(starts) - 1], strict=True))
+
+
+_RANGES = 4  # ranges of rows for each thread, which then end together
+
+
 class Workers:
     """Runs jobs that do not touch each other's results, on up to so many threads, the caller's among them."""
 
@@ -120,8 +134,43 @@ class Workers:
         if failures:
             raise failures[min(failures)]
 
+    def share(self, starts: IntArray, work: Callable[[int, int], object], least: int = 1) -> None:
+        """Call `work(begin, end)` for ranges of rows, whose answers must not depend on how they are cut.
 
-_ROW_BLOCKS = 8  # blocks of rows, whatever the threads; sums have one order
+        Args:
+            starts: (n + 1,) where the items of each row begin, by which ranges are cut alike.
+            work: see above.
+            least: items worth a thread; on fewer, handing work to a thread costs more than the work.
+        """
+        count = _RANGES * self.threads if self.threads > 1 and starts[-1] >= least else 1
+        self.run([partial(work, *rows) for rows in even_ranges(starts, count)])
+
+    def total(self, jobs: Sequence[Callable[[], tuple[FloatArray, ...]]]) -> tuple[FloatArray, ...]:
+        """Return the sums of the arrays that jobs return, of which there are 1, 2, 4, 8, ...
+
+        They are added two by two, as in a tree, each sum as soon as both parts of it are there: in one order,
+        and few of them are held at a time, log2 of their number where there is one thread.
+        """
+        waiting, lock = dict[tuple[int, int], tuple[FloatArray, ...]](), threading.Lock()
+
+        def run(k: int) -> None:
+            own, width = jobs[k](), 1
+            while width < len(jobs):
+                with lock:
+                    other = waiting.pop((width, k ^ width), None)
+                    if other is None:
+                        waiting[width, k] = own
+                        return
+                own, other = (own, other) if k < k ^ width else (other, own)
+                for total, more in zip(own, other, strict=True):
+                    np.add(total, more, out=total)
+                k, width = k & ~width, 2 * width
+            waiting[width, 0] = own
+
+        self.run([partial(run, k) for k in range(len(jobs))])
+        return waiting[len(jobs), 0]
+
+
 _ENTRIES_WORTH_A_THREAD = 50_000  # entries; on fewer, handing work to a thread costs more than the work
 
 
@@ -138,10 +187,6 @@ class LaplacianOperator:
         self._entries = np.empty(len(graph.edge_of), np.float32)
         self.reweigh(weights)
         self._workers = workers
-        entries = len(graph.neighbors)
-        blocks = _ROW_BLOCKS if entries >= _ENTRIES_WORTH_A_THREAD and workers.threads > 1 else 1
-        cuts = np.searchsorted(graph.pointers, np.arange(1, blocks) * (entries // blocks))
-        self._bounds = [0, *(int(cut) for cut in cuts), graph.num_nodes]
 
     def reweigh(self, weights: FloatArray) -> None:
         """Take other weights, (m,), in place of those before."""
@@ -159,10 +204,10 @@ class LaplacianOperator:
         apply = _apply_entries_3 if x.shape[1] == 3 else _apply_entries
         graph, entries = self.graph, self._entries
 
-        def job(first: int, last: int) -> Callable[[], object]:
-            return lambda: apply(first, last, graph.pointers, graph.neighbors, entries, x, out)
+        def work(first: int, last: int) -> None:
+            apply(first, last, graph.pointers, graph.neighbors, entries, x, out)
 
-        self._workers.run([job(a, b) for a, b in zip(self._bounds, self._bounds[1:], strict=False)])
+        self._workers.share(graph.pointers, work, _ENTRIES_WORTH_A_THREAD)
         return out
 
 

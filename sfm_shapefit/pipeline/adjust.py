@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm_shapefit.adjustment.covariance import FrameCovariances, estimate_covariances
-from sfm_shapefit.adjustment.freedom import GivenPoses
+from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import RotationPrior, isotropic_information
+from sfm_shapefit.adjustment.run import begin, solve_known_points
 from sfm_shapefit.adjustment.solve import Adjusted, adjust
 from sfm_shapefit.adjustment.sources import collect_tracks
 from sfm_shapefit.adjustment.views import views_of
@@ -22,6 +23,7 @@ from sfm_shapefit.files.colmap.reconstructions import arrays_of, moved_reconstru
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import ObservedTracks
+from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 
 if TYPE_CHECKING:
@@ -85,9 +87,7 @@ def bundle_adjust(
     model = reconstruction.reconstruction if hasattr(reconstruction, "reconstruction") else reconstruction
     read, _ = arrays_of(model)
     images, points, tracks = read_bundle(read)
-    has_ray = np.isfinite(tracks.on_plane).all(axis=1)
-    seen = np.where(has_ray, points.points_seen(), -1)
-    found = TriangulatedPoints(points=points.xyz, tracks=np.arange(points.num_points), points_seen=seen)
+    found = TriangulatedPoints.of_tracks(tracks, points.xyz)
     views, given = views_of(images), GivenPoses(fixed=np.isin(images.frames.ids, sorted(fixed_frames)))
     problem = views.problem(images, np.zeros(len(images.lenses), np.bool_), given, tracks, found)
     if rotation_sigma_deg is not None:
@@ -103,6 +103,19 @@ def bundle_adjust(
         adjusted=adjusted,
         covariances=estimate_covariances(solved, options) if covariances else None,
     )
+
+
+def adjust_joined(reconstruction: "pycolmap.Reconstruction", threads: int) -> "pycolmap.Reconstruction":
+    """Return a model whose parts were joined, poses and points of all adjusted together.
+
+    The scale of the loss is the one that the errors call for, as in the adjustments of `locate`: photographs
+    that were adjusted with a finer one than the default of `bundle_adjust` would get worse by that.
+    """
+    read, _ = arrays_of(reconstruction)
+    images, points, tracks = read_bundle(read)
+    run = begin(images, tracks, StructureOptions(), Freedom(), threads=threads)
+    run, last = solve_known_points(run, points.xyz)
+    return moved_reconstruction(read, run.images, replace(points, xyz=last.points))
 
 
 def read_bundle(model: ModelArrays) -> tuple[Images, Points, ObservedTracks]:

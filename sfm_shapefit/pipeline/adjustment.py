@@ -11,6 +11,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.adjustment.sources import links_touching
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
@@ -80,7 +81,8 @@ def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
     if source.fixed is not None:  # points that fixed images alone see move nothing
         links = links_touching(start, links, ~source.fixed[rows])
     freedom = replace(state.freedom_of(rows), pull_rad=state.inputs.pull_rad)
-    adjusted = adjust_placement(start, links, options.structure, freedom, state.given_poses(rows))
+    given = state.given_poses(rows)
+    adjusted = adjust_placement(begin(start, links, options.structure, freedom, given, clock.threads))
     del links
     similarity, centers = state.frame.similarity, np.empty((images.num_images, 3))
     centers[rows] = adjusted.images.centers

@@ -145,7 +145,7 @@ def check_source(
         if matches.inputs.is_made or not matches.has_database:  # nothing else measured lenses
             tracks = collect_tracks(model.images, structure.pictures, structure.points)
             rows = np.arange(model.images.num_images)
-            evidence = replace(evidence, shape=ask_shape(model.images, rows, tracks))
+            evidence = replace(evidence, shape=ask_shape(model.images, rows, tracks, clock.threads))
         weak = list(_find_weak(model.images, quality))
         second = None if fits is None or other is None else _compare(matches, fits, structure, other)
         if fits is not None and second is not None:

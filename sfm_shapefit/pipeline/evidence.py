@@ -143,19 +143,25 @@ def _tied_by_priors(state: ModelState, images: Images) -> IntArray | None:
     return rigid_strip(images, np.isin(images.frame_of, frames) & images.is_posed)
 
 
-def shape_of(state: ModelState) -> OpenShape | None:
+def shape_of(state: ModelState, threads: int) -> OpenShape | None:
     """Return what own tracks leave open of the delivered images, where nothing else holds their shape."""
     inputs, images = state.inputs, state.images
     if state.source.has_database or state.held is not None or inputs.fixed.any():
         return None
     links, lenses_held = state.read_links(images, nobody), inputs.options.freedom.intrinsics == "held"
     knows_rotations = inputs.pull_rad is not None and inputs.pull_rad < np.inf
-    rows = images.posed_rows
-    return ask_shape(images, rows, links, lenses_held=lenses_held, rotations_held=knows_rotations)
+    held = {"lenses_held": lenses_held, "rotations_held": knows_rotations}
+    return ask_shape(images, images.posed_rows, links, threads, **held)
 
 
 def ask_shape(
-    images: Images, rows: IntArray, tracks: Links, *, lenses_held: bool = False, rotations_held: bool = False
+    images: Images,
+    rows: IntArray,
+    tracks: Links,
+    threads: int,
+    *,
+    lenses_held: bool = False,
+    rotations_held: bool = False,
 ) -> OpenShape | None:
     """Return what own tracks leave open of where the posed images stand; None if that is not known.
 
@@ -163,12 +169,15 @@ def ask_shape(
         images: all.
         rows: (r,) of those with a pose, which the tracks have in that order.
         tracks: of the model's points.
+        threads: number of threads; the answer does not depend on it.
         lenses_held, rotations_held: whether the user knows these.
     """
     if not isinstance(tracks, ObservedTracks) or len(rows) < SMALLEST_SHAPE:
         return None
     held = {"lenses_held": lenses_held, "rotations_held": rotations_held}
-    found = None if all(held.values()) else estimate_open_shape(images.part(rows), tracks, **held)
+    if all(held.values()):
+        return None
+    found = estimate_open_shape(images.part(rows), tracks, **held, threads=threads)
     return None if found is None else OpenShape.of(images, rows, found)
 
 

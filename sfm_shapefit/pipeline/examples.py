@@ -14,6 +14,7 @@ from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.files.colmap.model import read_model
@@ -238,7 +239,7 @@ def adjust_bundle(folder: Path) -> None:
     """Adjust the tracks of a small model, and say how uncertain a bundle is, as after each placement."""
     model = read_model(_workspace(folder, WorkspaceOptions(database=False)))
     images, _, tracks = read_bundle(model.arrays)
-    adjust_thinly(images, lambda: tracks, StructureOptions(), Freedom())
+    adjust_thinly(begin(images, tracks, StructureOptions(), Freedom()))
     adjusted = adjust(_bundle(), loss_scale_px=1.0, threads=2)
     Lens("SIMPLE_FISHEYE", (500.0, 320.0, 240.0)).rays(np.zeros((1, 2)))
     estimate_covariances(adjusted.problem)

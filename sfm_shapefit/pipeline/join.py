@@ -26,7 +26,7 @@ from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model, renamed_as
 from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
-from sfm_shapefit.pipeline.adjust import bundle_adjust
+from sfm_shapefit.pipeline.adjust import adjust_joined
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out, see_matches
 from sfm_shapefit.pipeline.joined import JoinedGroup, Told, tell_group
@@ -102,7 +102,8 @@ def join(
         group = max(groups, key=lambda group: group.reconstruction.num_reg_images())
     if options.adjust == "full":
         with clock("adjustment"):
-            group = group._replace(reconstruction=bundle_adjust(group.reconstruction).reconstruction)
+            adjusted = adjust_joined(group.reconstruction, clock.threads)
+            group = group._replace(reconstruction=adjusted)
     notes = [f"{piece.label}: {note}" for piece in pieces for note in piece.model.notes]
     told = Told(joins, flat_values(options), inputs, notes=notes)
     with open_source(read_model(group.reconstruction), inputs) as source:

@@ -7,6 +7,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_seed
 from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.adjustment.views import views_of
@@ -77,7 +78,8 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
         posed = images.part(rows)
         if adjusts:  # which triangulates at the poses of the start itself
             freedom, given = state.freedom_of(rows), state.given_poses(rows)
-            bundle, points = adjust_seed(posed, links, options.structure, freedom, given)
+            run = begin(posed, links, options.structure, freedom, given, clock.threads)
+            bundle, points = adjust_seed(run)
             posed, images = bundle.images, images.updated(bundle.images)
         else:
             points = triangulate(posed, links, options.structure, clock.advance, clock.threads)

@@ -201,7 +201,7 @@ def set_gauge(state: ModelState) -> ModelState:
 def examine_model(state: ModelState, clock: Clock) -> ModelState:
     """Ask for evidence that the fit did not use; nothing says where groups stand that hang loose by it."""
     with clock("trust"):
-        evidence, shape, judged = question(state, clock), shape_of(state), state.judged
+        evidence, shape, judged = question(state, clock), shape_of(state, clock.threads), state.judged
         if shape is not None:
             judged = replace(judged, open_covariances=open_beyond_noise(state, shape))
         for group in (group for group in evidence.untied if group.is_loose):

@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
+from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.pairs.essential import (
@@ -83,10 +84,13 @@ def adjust_first_placement(
         start = placed.placed()
         rows = start.posed_rows
         adjusted = adjust_thinly(
-            start.part(rows),
-            partial(placed.read_links, start, clock.advance),
-            options.structure,
-            placed.freedom_of(rows),
+            begin(
+                start.part(rows),
+                placed.read_links(start, clock.advance),
+                options.structure,
+                placed.freedom_of(rows),
+                threads=clock.threads,
+            ),
             lenses_wanted=lenses_wanted,
             rotations_known=rotations_known,
         )

@@ -62,6 +62,13 @@ class TriangulatedPoints:
     points_seen: IntArray
     """(m,) the point of each observation of the tracks, -1 for those that are of none."""
 
+    @classmethod
+    def of_tracks(cls, tracks: ObservedTracks, points: FloatArray) -> "TriangulatedPoints":
+        """Return points (t, 3) that are known, one for each track; rays that do not point ahead see none."""
+        has_ray = np.isfinite(tracks.on_plane).all(axis=1)
+        seen = np.where(has_ray, tracks.list_of_rows(), -1)
+        return cls(points=points, tracks=np.arange(tracks.num_tracks), points_seen=seen)
+
     def of_length(self, least: int) -> "TriangulatedPoints":
         """Return the points with at least that many observations; the observations of others are of none."""
         seen = self.points_seen

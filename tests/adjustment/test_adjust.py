@@ -248,13 +248,18 @@ def test_entries_given_up_while_a_system_is_factored_change_nothing(monkeypatch,
 
 @pytest.mark.parametrize("solver", ["dense", "sparse"])
 def test_threads_do_not_change_one_bit(solver):
-    _, start = make_start(num_cameras=20, num_points=400, models=("OPENCV", "PINHOLE"))
-    options = AdjustmentOptions(linear_solver=solver, free_focal_lengths=True, max_iterations=8)
-    one = adjust(start, options)
-    several = adjust(start, replace(options, threads=3))
-    np.testing.assert_array_equal(several.problem.centers, one.problem.centers)
-    np.testing.assert_array_equal(several.problem.points, one.problem.points)
-    np.testing.assert_array_equal(several.costs, one.costs)
+    """Enough cameras for strips of a dense factor, and observations for several chunks of points."""
+    _, start = make_start(num_cameras=48, num_points=400, models=("OPENCV", "PINHOLE"))
+    options = AdjustmentOptions(linear_solver=solver, free_focal_lengths=True, max_iterations=4)
+    found = [adjust(start, options, threads=threads) for threads in (1, 2, 3, 7)]
+    known = [
+        (one.costs, one.problem.centers, one.problem.points, known.centers, known.rotations)
+        for one, threads in zip(found, (1, 2, 3, 7), strict=True)
+        for known in [estimate_covariances(one.problem, options, threads=threads)]
+    ]
+    for other in known[1:]:
+        for expected, array in zip(known[0], other, strict=True):
+            np.testing.assert_array_equal(array, expected)
 
 
 def test_the_order_of_observations_matters_to_rounding_only():
@@ -348,7 +353,7 @@ def make_bent_row(num_cameras, bend):
         lenses=(Lens("SIMPLE_PINHOLE", LENSES["SIMPLE_PINHOLE"]),),
         lens_of_camera=np.zeros(num_cameras, dtype=np.int64),
     )
-    exact = reprojection_residuals(lay_out(truth, AdjustmentOptions()), values_of(truth))
+    exact = reprojection_residuals(truth, values_of(truth))
     truth = replace(truth, pixels=exact + 0.5 * rng.standard_normal(exact.shape))
     along = centers[:, 0] / half - 1.0
     turns = Rotation.from_euler("z", np.arctan(2.0 * bend / half * along[:, None])).as_matrix()
@@ -471,7 +476,7 @@ def test_wrong_priors_lenses_and_options_are_refused():
     for wrong in (
         {"loss_scale_px": 0.0},
         {"noise_px": np.inf},
-        {"threads": 0},
+        {"threads": -1},
         {"linear_solver": "lu"},
         {"first_damping": -1e-4},
     ):

@@ -88,7 +88,7 @@ def whole_matrix(layout, normal):
 
 def assert_normal_matrix_is_that_of_differences(problem):
     layout, values = lay_out(problem, ALL_FREE), values_of(problem)
-    jacobian = differences(layout, values, lambda v: reprojection_residuals(layout, v).ravel())
+    jacobian = differences(layout, values, lambda v: reprojection_residuals(problem, v).ravel())
     expected = jacobian @ jacobian.T
     found = whole_matrix(layout, linearize(layout, values, None, ONE))
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
@@ -131,12 +131,12 @@ def test_the_curvature_of_the_loss_is_exact_where_it_bends_up():
     # Along a residual of square s = c^2 u the loss has second derivative w (1 - u) / (1 + u), across it w.
     problem = small_problem("PINHOLE", sensors=0)
     layout, values = lay_out(problem, ALL_FREE), values_of(problem)
-    scale = 10.0 * float(np.abs(reprojection_residuals(layout, values)).max())
-    residuals = reprojection_residuals(layout, values)
+    scale = 10.0 * float(np.abs(reprojection_residuals(problem, values)).max())
+    residuals = reprojection_residuals(problem, values)
     squares = np.sum(residuals**2, axis=1)
     w = 1.0 / (1.0 + squares / scale**2)
     along = w**2 * (1.0 - squares / scale**2)
-    jacobian = differences(layout, values, lambda v: reprojection_residuals(layout, v).ravel())
+    jacobian = differences(layout, values, lambda v: reprojection_residuals(problem, v).ravel())
     j = jacobian.reshape(len(jacobian), -1, 2)
     unit = residuals / np.sqrt(squares)[:, None]
     weights = w[:, None, None] * np.eye(2) + (along - w)[:, None, None] * unit[:, :, None] * unit[:, None, :]
@@ -152,7 +152,7 @@ def test_a_point_behind_its_camera_adds_nothing_and_counts_as_a_focal_length():
     away = 2.0 * problem.centers[0]  # behind camera 0, which looks at the origin, in front of others
     behind.points[0] = away
     layout, values = lay_out(behind, ALL_FREE), values_of(behind)
-    residuals = reprojection_residuals(layout, values)
+    residuals = reprojection_residuals(behind, values)
     lost = np.isnan(residuals[:, 0])
     assert (lost == ((behind.cameras_seeing == 0) & (behind.points_seen == 0))).all()
     squares = np.where(lost, 500.0**2, np.sum(residuals**2, axis=1))

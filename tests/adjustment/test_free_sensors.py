@@ -26,7 +26,7 @@ def rig_problem(rng, offset=0.3):
     free = np.tile([-1, 0, 1], FRAMES)
     rig = replace(problem.rig, rotations=rotations, translations=translations, free_sensor_of_camera=free)
     problem = replace(problem, rig=rig)
-    exact = reprojection_residuals(lay_out(problem, SQUARES), values_of(problem)) + problem.pixels
+    exact = reprojection_residuals(problem, values_of(problem)) + problem.pixels
     return replace(problem, pixels=exact + 0.5 * rng.standard_normal(exact.shape))
 
 

@@ -292,7 +292,10 @@ def test_lenses_that_were_found_before_are_held_in_the_first_solve_and_damped_in
         Freedom(parts=np.array([True, False])),
     )
     for one, is_free in ((given, True), (found, False)):
-        adjust_thinly(images.with_lenses([one]), lambda: links, StructureOptions(), free, lenses_wanted=True)
+        adjust_thinly(
+            adjustment_run.begin(images.with_lenses([one]), links, StructureOptions(), free),
+            lenses_wanted=True,
+        )
         assert frees[:2] == [is_free, True]
         assert dampings[:2] == [1e-4, 1e-8 if is_free else 1e-4]
         frees.clear()

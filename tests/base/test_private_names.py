@@ -33,7 +33,7 @@ def scipy_has_ufuncs():
 
 
 def scipy_has_lapack():
-    return callable(import_module("scipy.linalg._flapack").dpotrf)
+    return callable(import_module("scipy.linalg._flapack").dpotrs)
 
 
 def scipy_has_superlu():

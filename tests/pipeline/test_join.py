@@ -14,6 +14,8 @@ from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import write_model
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
+from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
+from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.facts.test_schema import problems
 from tests.models import only
 from tests.pipeline.made import DATABASE, FOLDER, PAIR
@@ -276,6 +278,26 @@ def test_three_models_are_joined_at_once():
     assert list(found.table("cameras")["name"]) == [camera.name for camera in found.cameras]
     assert errors_of(sfm_shapefit.check(found, DATABASE)) == errors_of(found)
     assert errors_of(found.reconstruction) == (8, pytest.approx(0.0, abs=1e-4))
+
+
+def test_an_adjustment_of_the_whole_chooses_its_loss_and_makes_photographs_better(tmp_path):
+    """Most keypoints far better than the rest, as of photographs; a loss of 1 px gives most of that away."""
+    scene = make_scene(SceneOptions(num_images=16, num_points=480, pixel_noise_px=0.1))
+    write_workspace(scene, tmp_path / "drawn", WorkspaceOptions(database=False))
+    truth = pycolmap.Reconstruction(tmp_path / "drawn" / "sparse" / "0")
+    photographed, rng = pycolmap.Reconstruction(truth), np.random.default_rng(0)
+    for i in sorted(photographed.reg_image_ids()):
+        for point in photographed.image(i).points2D:
+            point.xy = point.xy + (rng.random() < 0.3) * rng.normal(0.0, 1.5, 2)
+    ids = sorted(photographed.reg_image_ids())
+    parts = [only(photographed, some) for some in (ids[:11], ids[8:])]
+    models = [sfm_shapefit.bundle_adjust(part, loss_scale_px=0.25).reconstruction for part in parts]
+    joined, whole = (sfm_shapefit.join(models, adjust=adjust).reconstruction for adjust in ("none", "full"))
+    at_one_px = sfm_shapefit.bundle_adjust(joined).reconstruction
+    before, after, worse = (
+        sfm_shapefit.evaluate(model, truth).position.mean for model in (joined, whole, at_one_px)
+    )
+    assert after < 0.9 * before < before < worse
 
 
 def test_what_ties_too_little_is_refused_with_its_reason(tmp_path):

@@ -270,3 +270,16 @@ def test_no_progress_is_told_of_a_stage_that_has_ended():
 
     sfm_shapefit.locate(RING / "sparse" / "0", progress=hear)
     assert told_late == []
+
+
+def test_threads_change_no_byte_of_a_model_whose_adjustment_they_share(drawn_workspace, tmp_path):
+    """Enough images for strips of the dense factor, and observations for several chunks of points."""
+    model = drawn_workspace("ring", num_images=48, num_points=1200) / "sparse" / "0"
+    written = []
+    for threads in (1, 2, 3, 7):
+        out = tmp_path / str(threads)
+        sfm_shapefit.write_result(sfm_shapefit.locate(model, threads=threads, adjust="full"), out)
+        files = [*out.glob("*.bin"), out / "cameras.csv"]
+        written.append({path.name: path.read_bytes() for path in files})
+    assert len(written[0]) > 4
+    assert written[1:] == written[:1] * 3

@@ -262,7 +262,7 @@ def test_pairs_of_fixed_cameras_cost_nothing_and_the_others_stand_as_with_them(m
     monkeypatch.setattr(
         adjustment_stage,
         "adjust_placement",
-        lambda images, links, *args: adjusted.append(links) or adjust_placement(images, links, *args),
+        lambda run: adjusted.append(run.links) or adjust_placement(run),
     )
     found = sfm_shapefit.locate(model, RING / "database.db", fix=str(names))
     pairs = np.concatenate([batch.pairs for batch in measured])
