@@ -30,6 +30,7 @@ from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints,
 
 # Observations between which Python can be interrupted: about 0.1 s.
 _SLICE = 100_000
+_SLICES_A_THREAD = 4  # slices of tracks at least, so that one whose tracks are long holds up few
 _PAIRS = 15  # pairs of observations that are tried for each point; all of six observations
 _STEPS = 5  # Gauss-Newton steps for a point; they begin within the limit of its observations
 _STILL = 1e-9  # length of a step over the distance of the point; the steps end with a shorter one
@@ -101,14 +102,15 @@ def triangulate_tracks(
         tracks.offsets, tracks.cameras, tracks.on_plane, poses.rotations, poses.centers,
         poses.focal_lengths_px, poses.images, figures, most, int(lengths.max(initial=0)),
     )  # fmt: skip
-    cuts = np.searchsorted(tracks.offsets, np.arange(0, len(seen), _SLICE)[1:]).tolist()
+    number = max(len(seen) // _SLICE, _SLICES_A_THREAD * threads if threads > 1 else 1)
+    cuts = np.searchsorted(tracks.offsets, np.arange(1, number) * len(seen) // number).tolist()
     slices = list(pairwise([0, *cuts, tracks.num_tracks]))
 
     def fill(own: tuple[int, int]) -> IntArray:
         first = int(room[own[0]])
         return np.arange(first, _triangulate(*own, first, given, points, track_of, seen))
 
-    kept = np.concatenate(list(in_threads(min(threads, len(slices)), fill, slices)))
+    kept = np.concatenate(list(in_threads(threads, fill, slices)))
     place = np.full(len(points) + 1, -1)
     place[kept] = np.arange(len(kept))
     return TriangulatedPoints(points=points[kept], tracks=track_of[kept], points_seen=place[seen])
