@@ -49,6 +49,7 @@ from sfm_shapefit.adjustment.sources import Links, with_rays_of
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.threads import count_threads
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import FOCAL
 from sfm_shapefit.scene.points import Points
@@ -138,13 +139,13 @@ class AdjustmentRun:
             min_angle_deg=self.options.min_triangulation_angle_deg,
             min_length=self.checked_length if checked else self.options.min_track_length,
         )
-        poses = views_of(self.images).poses(self.images)
+        poses, threads = views_of(self.images).poses(self.images), count_threads(self.threads)
         assert self.links is not None
         if isinstance(self.links, ObservedTracks):
-            joined, found = self.links, triangulate_tracks(self.links, poses, limits)
+            joined, found = self.links, triangulate_tracks(self.links, poses, limits, threads)
         else:
             error_px = self.options.max_reprojection_error_px
-            joined, found = triangulate_matches(self.links, poses, limits, error_px)
+            joined, found = triangulate_matches(self.links, poses, limits, error_px, threads)
         frames = self.images.frame_of[views_of(self.images).images[joined.cameras]]
         return joined, _without_lone_frames(found, frames, limits.min_length)
 

@@ -44,6 +44,7 @@ def triangulate(
     links: Links,
     options: StructureOptions,
     advance: Advance = nobody,
+    threads: int = 1,
 ) -> Points:
     """Return the points of links at the poses of images, a block of tracks at a time; none is filtered.
 
@@ -55,6 +56,7 @@ def triangulate(
         links: their matches, or tracks.
         options: what points must satisfy.
         advance: called with the tracks of the first joining that are done, and their number.
+        threads: number of threads to share the work among; the answer does not depend on it.
     """
     views = views_of(images)
     limits = PointLimits(
@@ -66,7 +68,7 @@ def triangulate(
     if isinstance(links, ObservedTracks):
         done = 0
         for block in map(links.subset, _blocks(np.flatnonzero(links.lengths() >= limits.min_length))):
-            parts.append(views.seen_points(block, triangulate_tracks(block, poses, limits)))
+            parts.append(views.seen_points(block, triangulate_tracks(block, poses, limits, threads)))
             done += block.num_tracks
             advance(done, links.num_tracks)
         return concatenate_points(parts)
@@ -77,7 +79,7 @@ def triangulate(
     for limit_px in joining_limits:
         matched, partners = matched.among(is_left), partners[is_left]
         hand_back_memory()  # before the rays of all keypoints take some
-        joined = matched.join(poses, limit_px)
+        joined = matched.join(poses, limit_px, threads)
         if limit_px < joining_limits[-1]:  # two keypoints may find a third one in the next joining
             sizes = np.diff(joined.offsets)
         else:  # two keypoints count 2 if they have no other partner, 3 or more if one has
@@ -86,7 +88,7 @@ def triangulate(
         done = 0
         for own in map(joined.subset, _blocks(chosen)):
             tracks = matched.observed(own)
-            found = triangulate_tracks(tracks, poses, limits)
+            found = triangulate_tracks(tracks, poses, limits, threads)
             parts.append(views.seen_points(tracks, found))
             is_left[own.rows[found.points_seen >= 0]] = False
             done += tracks.num_tracks

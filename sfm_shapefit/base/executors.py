@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from itertools import pairwise
 from typing import TypeVar
 
 from sfm_shapefit.base.errors import ShapeFitError
@@ -13,6 +14,7 @@ Advance = Callable[[int, int], None]
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
+_RANGES_A_THREAD = 4  # ranges of items for each thread, so that one whose items are slow holds up few
 _TASKS_AT_ONCE = 32  # tasks submitted ahead of the answers; bounds the memory that they take
 
 
@@ -27,6 +29,26 @@ def in_threads(threads: int, work: Callable[[Task], Answer], tasks: Iterable[Tas
         return
     with ThreadPoolExecutor(threads) as pool:
         yield from pool.map(work, tasks)
+
+
+def in_ranges(threads: int, count: int, work: Callable[..., object], *given: object) -> None:
+    """Call `work(begin, end, *given)` for ranges that make up `count` items, each of which it fills."""
+    number = min(count, _RANGES_A_THREAD * threads if threads > 1 else 1)
+    cuts = (count * k // number for k in range(number + 1)) if number else ()
+    for _ in in_threads(threads, lambda cut: work(*cut, *given), pairwise(cuts)):
+        pass
+
+
+def made_ahead(threads: int, items: Iterator[Answer]) -> Iterator[Answer]:
+    """Yield items, the next of which another thread makes meanwhile; a single thread is the caller's."""
+    if threads <= 1:
+        yield from items
+        return
+    with ThreadPoolExecutor(1) as pool:
+        following = pool.submit(next, items, None)
+        while (item := following.result()) is not None:
+            following = pool.submit(next, items, None)
+            yield item
 
 
 class WorkerError(ShapeFitError):

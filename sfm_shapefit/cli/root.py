@@ -4,6 +4,7 @@ import atexit
 import gc
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,17 +35,23 @@ _GROUPS = {
 _OBJECTS_BETWEEN_SEARCHES = (50_000, 20, 100)
 
 
+_PLAIN: dict[Any, Any] = {str: str, Path: Path, int: int, float: float, int | None: int, float | None: float}
+"""What makes a value of a word, by its type."""
+
+
 class _PlainConversion:
-    """What typer does to words and paths; for the rest it imports pydantic, a twentieth of a short run."""
+    """What typer does to words, paths and numbers; for the rest it imports pydantic, a twentieth of a run."""
 
     def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the value of a parameter; what is no single word or path is converted by typer."""
+        """Return the value of a parameter; what is not single, limited, or no such value is left to typer."""
         is_list = param.multiple or param.nargs != 1
         if value is None:
             return () if is_list else None
-        kind = param.type_descriptor.annotation
-        if not is_list and kind in (str, Path) and type(value) is str:
-            return kind(value)
+        kind, limits = param.type_descriptor.annotation, param.type_descriptor.parameter_info
+        is_limited = limits.min is not None or limits.max is not None
+        if not (is_list or is_limited) and kind in _PLAIN and type(value) is str:
+            with suppress(ValueError):
+                return _PLAIN[kind](value)
         return type(param).get_runtime_param(param).coerce(value, param=param, ctx=ctx)
 
 

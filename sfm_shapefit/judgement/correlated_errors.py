@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.geometry import tangent_bases
 from sfm_shapefit.base.jit import cross, inner_kernel, kernel, mix_bits
 from sfm_shapefit.scene.matches import MatchBatch
@@ -38,6 +39,7 @@ def sample_direction_errors(
     covariances: FloatArray,
     noise_px: FloatArray,
     threshold_px: float,
+    threads: int = 1,
 ) -> FloatArray:
     """Return samples (k, NUM_SAMPLES, 2) of tangential errors of directions that share keypoints, radians.
 
@@ -50,6 +52,7 @@ def sample_direction_errors(
         covariances: (k, 2, 2) in `tangent_bases(directions)`, rad^2.
         noise_px: (k,) standard deviation of the Sampson errors behind the covariances.
         threshold_px: largest Sampson error of an inlier.
+        threads: number of threads to share the pairs among.
     """
     scores = np.zeros((len(matches.pairs), NUM_SAMPLES, 3))
     has_direction: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))
@@ -57,7 +60,7 @@ def sample_direction_errors(
     keypoints = np.ascontiguousarray(matches.keypoints)
     rays_i, rays_j = np.ascontiguousarray(matches.rays_i), np.ascontiguousarray(matches.rays_j)
     arrays = matches.pairs, matches.offsets, keypoints, rays_i, rays_j, matches.pixel_angles
-    _add_scores(*arrays, has_direction, v, threshold_px, scores)
+    in_ranges(threads, len(scores), _add_scores, *arrays, has_direction, v, threshold_px, scores)
     bases = tangent_bases(v)
     gain = np.nan_to_num(covariances) @ bases.transpose(0, 2, 1) / np.maximum(noise_px, 1e-12)[:, None, None]
     return np.asarray(scores @ gain.transpose(0, 2, 1))
@@ -65,14 +68,14 @@ def sample_direction_errors(
 
 @kernel
 def _add_scores(
-    pairs: Any, offsets: Any, keypoints: Any, rays_i: Any, rays_j: Any, pixel_angles: Any,
-    has_direction: Any, directions: Any, threshold_px: float, scores: Any,
+    begin: int, end: int, pairs: Any, offsets: Any, keypoints: Any, rays_i: Any, rays_j: Any,
+    pixel_angles: Any, has_direction: Any, directions: Any, threshold_px: float, scores: Any,
 ) -> None:  # fmt: skip
-    """Add (a x b) r / gradient over the inlier matches of each pair, for every sample."""
+    """Add (a x b) r / gradient over the inlier matches of the pairs begin..end-1, for every sample."""
     a, b, normal = np.empty(3), np.empty(3), np.empty(3)
     across_a, across_b, factors = np.empty(3), np.empty(3), np.empty(4)
     axes, sums = np.empty((2, 3)), np.empty((3, NUM_SAMPLES))
-    for p in range(len(pairs)):
+    for p in range(begin, end):
         if not has_direction[p]:
             continue
         v = directions[p]

@@ -8,25 +8,34 @@ near duplicates that a fold has put apart are not.
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.executors import in_ranges
+from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.judgement.evidence import Oddity
 from sfm_shapefit.judgement.limits import FEW, FEWEST_POINTS, HALF, RARE
 from sfm_shapefit.judgement.reasons import Kind
+from sfm_shapefit.pairs.kernels import median, select_rank
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.scene.images import Images, Pictures
-from sfm_shapefit.scene.matches import View, is_among
+from sfm_shapefit.scene.matches import KeypointMatches, View, is_among
 from sfm_shapefit.scene.points import Points
 
 
 def find_split_duplicates(
-    images: Images, points: Points, pictures: Pictures, directions: PairDirections, view: View
+    images: Images,
+    points: Points,
+    pictures: Pictures,
+    directions: PairDirections,
+    view: View,
+    threads: int = 1,
 ) -> Iterator[Oddity]:
     """Yield the images that have a near duplicate which stands half the distance to their points away.
 
-    The `directions` are of pairs of the view, some of which have none.
+    The `directions` are of pairs of the view, some of which have none; `threads` share these.
     """
     pairs, counts, most = directions.pairs, directions.num_matches, np.zeros(images.num_images)
     np.maximum.at(most, pairs, counts[:, None])
@@ -34,7 +43,8 @@ def find_split_duplicates(
     apart = np.linalg.norm(images.centers[pairs[:, 0]] - images.centers[pairs[:, 1]], axis=1)
     apart /= _depths(images, points)[pairs].max(axis=1)
     pairs, apart = pairs[asked & (apart > HALF)], apart[asked & (apart > HALF)]
-    split, most = is_among(pairs, _find_duplicates(images, pictures, pairs, view)), np.zeros_like(most)
+    found = _find_duplicates(images, pictures, pairs, view, threads)
+    split, most = is_among(pairs, found), np.zeros_like(most)
     np.maximum.at(most, pairs[split], apart[split, None])
     if len(named := np.flatnonzero(most)):
         sentence = "a near duplicate that stands {} times the distance to its points away"
@@ -51,20 +61,60 @@ def _depths(images: Images, points: Points) -> FloatArray:
     return depths
 
 
-def _find_duplicates(images: Images, pictures: Pictures, pairs: IntArray, view: View) -> IntArray:
+def _find_duplicates(
+    images: Images, pictures: Pictures, pairs: IntArray, view: View, threads: int
+) -> IntArray:
     """Return those of some pairs (k, 2) that are near duplicates."""
     found = [np.zeros((0, 2), dtype=np.int64)]
     for batch in view.links(chosen=is_among(view.pairs, pairs)) if len(pairs) else ():
-        for pair, begin, end in zip(batch.pairs, batch.offsets[:-1], batch.offsets[1:], strict=True):
-            i, j = (
-                pictures.pixels(k, own) / max(images.lenses[images.lens_of[k]].width, 1)
-                for k, own in zip(pair.tolist(), batch.keypoints[begin:end].T, strict=True)
-            )
-            if end > begin and _reach(i - j) <= RARE * 2.0 * _reach(i - np.median(i, axis=0)):
-                found.append(pair[None])
+        first, second = (_places(images, pictures, batch, side) for side in (0, 1))
+        near = np.zeros(len(batch.pairs), dtype=np.bool_)
+        given = batch.offsets, first, second, near
+        in_ranges(threads, len(near), _find_near, *given)
+        found.append(batch.pairs[near])
     return np.concatenate(found)
 
 
-def _reach(offsets: FloatArray) -> float:
-    """Return the length that nine of ten offsets (k, 2) have at most."""
-    return float(np.quantile(np.linalg.norm(offsets, axis=1), 1.0 - FEW))
+def _places(images: Images, pictures: Pictures, batch: KeypointMatches, side: int) -> FloatArray:
+    """Return where the matches of pairs are in their first or second image, (M, 2), in its widths."""
+    image_of = np.repeat(batch.pairs[:, side], np.diff(batch.offsets))
+    order, (present, begins) = np.argsort(image_of, kind="stable"), np.unique(image_of, return_counts=True)
+    places = np.empty((len(image_of), 2))
+    for image, rows in zip(present.tolist(), np.split(order, np.cumsum(begins)[:-1]), strict=True):
+        width = max(images.lenses[images.lens_of[image]].width, 1)
+        places[rows] = pictures.pixels(image, batch.keypoints[rows, side]) / width
+    return places
+
+
+@kernel
+def _find_near(begin: int, end: int, offsets: Any, first: Any, second: Any, near: Any) -> None:
+    """Write which of the pairs begin..end-1 are near duplicates, by the places of their matches."""
+    middle, nowhere = np.empty(2), np.zeros(2)
+    for p in range(begin, end):
+        count = offsets[p + 1] - offsets[p]
+        if count > 0:
+            own, work = first[offsets[p] : offsets[p + 1]], np.empty(count)
+            moved = np.empty((count, 2))
+            for c in range(2):
+                for k in range(count):
+                    work[k] = own[k, c]
+                    moved[k, c] = own[k, c] - second[offsets[p] + k, c]
+                middle[c] = median(work, count)
+            spread = _reach(own, middle, count, work)
+            near[p] = _reach(moved, nowhere, count, work) <= RARE * 2.0 * spread
+
+
+@inner_kernel
+def _reach(places: Any, middle: Any, count: int, work: Any) -> float:
+    """Return the distance from the middle that nine of ten places (count, 2) have at most."""
+    for k in range(count):
+        x, y = places[k, 0] - middle[0], places[k, 1] - middle[1]
+        work[k] = np.sqrt(x * x + y * y)
+    place = (1.0 - FEW) * (count - 1)
+    rank = int(place)
+    low = high = select_rank(work, count, rank)
+    if rank + 1 < count:
+        high = work[rank + 1]
+        for k in range(rank + 2, count):
+            high = min(high, work[k])
+    return float(low + (high - low) * (place - rank))

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
-from sfm_shapefit.base.executors import in_threads
+from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.losses import CAUCHY, weighed
@@ -108,7 +108,7 @@ def leave_one_out(
     arrays = *(frozen(np.ascontiguousarray(array)) for array in given), counts, figures
 
     rows = np.arange(n) if asked is None else np.flatnonzero(asked)
-    list(in_threads(threads, lambda own: fit_images(own, *arrays), np.array_split(rows, max(threads, 1))))
+    in_ranges(threads, len(rows), fit_images, rows, *arrays)
     return LeftOut(counts, *figures.T)
 
 
@@ -143,16 +143,16 @@ def _are_angular(images: Images) -> BoolArray:
 
 @kernel
 def fit_images(
-    rows: Any, xyz: Any, offsets: Any, image_of: Any, point_of: Any, rays: Any, on_plane: Any,
-    order: Any, begins: Any, rotations: Any, centers: Any, focal_px: Any, angular: Any, believed: Any,
-    counts: Any, figures: Any,
+    begin: int, end: int, rows: Any, xyz: Any, offsets: Any, image_of: Any, point_of: Any, rays: Any,
+    on_plane: Any, order: Any, begins: Any, rotations: Any, centers: Any, focal_px: Any, angular: Any,
+    believed: Any, counts: Any, figures: Any,
 ) -> None:  # fmt: skip
-    """Fill counts and figures of some images by the points as the others make them."""
+    """Fill counts and figures of the images rows[begin:end] by the points as the others make them."""
     held, seen = np.empty((_MOST_OBSERVATIONS, 3)), np.empty((_MOST_OBSERVATIONS, 2))
     spread, lines = np.empty((_MOST_OBSERVATIONS, 6)), np.empty((_MOST_OBSERVATIONS, 2, 8))
     squares, work = np.empty(_MOST_OBSERVATIONS), np.empty(_MOST_OBSERVATIONS)
     system, rotation, total, basis = np.empty((8, 8)), np.empty((3, 3)), np.empty(9), np.empty((2, 3))
-    for i in rows:
+    for i in rows[begin:end]:
         size = begins[i + 1] - begins[i]
         taken, count = min(size, _MOST_OBSERVATIONS), 0
         for k in range(taken):

@@ -34,7 +34,7 @@ _MERGE_ALWAYS = 0.03  # share of zeros in the merged panel; up to it a child joi
 _MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))  # columns and share of zeros; small panels may have more
 _LARGEST_TASK = 1 / 6  # share of all entries; subtrees with more are divided, so that threads end together
 _SMALLEST_TASK = 1 / 40  # share of all entries; subtrees with less are left to the part above
-_WORTH_TASKS = 500_000  # entries of the panels; with fewer, handing out work costs more than the work
+_WORTH_TASKS = 50_000  # entries of the panels; with fewer, handing out work costs more than the work
 
 
 @dataclass(frozen=True, slots=True, eq=False)

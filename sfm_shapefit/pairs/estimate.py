@@ -1,13 +1,12 @@
 """Directions of many pairs from their matches, and which to believe."""
 
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, frozen
-from sfm_shapefit.base.executors import in_threads
+from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.pairs.kernels import MEASURES, MIN_MATCHES, estimate_pairs
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, first_reasons, is_usable
@@ -34,8 +33,7 @@ def run_over_pairs(kernel: Callable[..., None], matches: RayMatches, threads: in
     """Call a kernel with ranges of pairs, the arrays of all, and what else it takes, from several threads."""
     rays = frozen(np.ascontiguousarray(matches.rays_i)), frozen(np.ascontiguousarray(matches.rays_j))
     arrays = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
-    cuts = [len(matches.pairs) * share // threads for share in range(threads + 1)]
-    list(in_threads(threads, lambda cut: kernel(*cut, *arrays, *others), pairwise(cuts)))
+    in_ranges(threads, len(matches.pairs), kernel, *arrays, *others)
 
 
 def _judge(

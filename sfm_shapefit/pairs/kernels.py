@@ -238,14 +238,14 @@ def _measure_noise(
         seen += (abs(residuals[k]) < cutoff_px) & (work[seen] > _VOTE_SIGMAS * noise_px)
     if seen < MIN_MATCHES:
         return noise_px, _NO_CAP_PX
-    return noise_px, _LEVERAGE * _select(work, int(seen), int(_LEVERAGE_QUANTILE * (seen - 1)))
+    return noise_px, _LEVERAGE * select_rank(work, int(seen), int(_LEVERAGE_QUANTILE * (seen - 1)))
 
 
 @inner_kernel
 def median(values: FloatArray, count: int) -> float:
     """Return the median of the first `count` values, at least one; reorders them."""
     half = count >> 1
-    upper = _select(values, count, half)
+    upper = select_rank(values, count, half)
     if count & 1:
         return upper
     lower = values[0]
@@ -255,7 +255,7 @@ def median(values: FloatArray, count: int) -> float:
 
 
 @inner_kernel
-def _select(values: FloatArray, count: int, rank: int) -> float:
+def select_rank(values: FloatArray, count: int, rank: int) -> float:
     """Return the value of a rank, from 0, among the first `count`; none before it is larger then.
 
     As Hoare's, but parted without a branch for each number, which processors could not foresee (Lomuto).

@@ -67,7 +67,8 @@ def gather_evidence(
     if fits is None:
         return ModelEvidence(lenses=lenses, oddities=odd)
     if source.has_database and _has_keypoints(source.view, structure):
-        odd = (*odd, *find_split_duplicates(images, points, pictures, fits.directions, source.view))
+        given = images, points, pictures, fits.directions, source.view
+        odd = (*odd, *find_split_duplicates(*given, threads))
     tied, untied = _tie(source, fits, structure)
     cuts, seams = find_cuts(*fits.sides, tied), tuple[Seam, ...]()
     if cuts:  # which are seams by the rotations that pairs across have by themselves

@@ -92,7 +92,8 @@ def measure(
     Raises:
         UnsolvableError: if no pair has a match.
     """
-    beside, without = _Beside(source, options.inlier_threshold_px, wanted), source.pairs_of_fixed
+    beside = _Beside(source, options.inlier_threshold_px, wanted, clock.threads)
+    without = source.pairs_of_fixed
     if clock.executor is not None and source.has_database:
         parts = measure_with_workers(source.view, partial(estimate_directions, options=options), clock)
         if without is not None and parts:
@@ -103,7 +104,7 @@ def measure(
                 beside.add(batch, directions)
     else:
         parts = []
-        for batch in source.view.batches(without=without, advance=clock.advance):
+        for batch in source.view.batches(1, without, clock.advance, clock.threads):
             parts.append(estimate_directions(batch, options, clock.threads))
             beside.add(batch, parts[-1])
     if not parts and without is not None:
@@ -140,8 +141,8 @@ def _again(source: MatchSource, directions: PairDirections) -> Iterator[tuple[Ma
 class _Beside:
     """What is made of each batch beside its directions."""
 
-    def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted) -> None:
-        view = source.view
+    def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted, threads: int) -> None:
+        view, self._threads = source.view, threads
         self._threshold_px, self._num_usable, self._counts_pairs = threshold_px, 0, wanted.facts
         is_sampled = wanted.errors and view.num_pairs <= _MOST_PAIRS
         self.errors: list[FloatArray] | None = [] if is_sampled else None
@@ -166,7 +167,7 @@ class _Beside:
         if self.errors is not None:
             noise_px = SIGMA_PER_MEDIAN * directions.median_residual_px
             given = batch, directions.directions, directions.covariance, noise_px, self._threshold_px
-            self.errors.append(sample_direction_errors(*given)[usable])
+            self.errors.append(sample_direction_errors(*given, self._threads)[usable])
 
     def facts_per_match(self) -> float:
         """Return what `Evidence` says: a track of k keypoints, each in k - 1 pairs, gives 2 k - 3 facts."""

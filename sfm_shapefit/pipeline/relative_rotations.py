@@ -156,7 +156,7 @@ def estimate_here(
     `estimate` is called with a batch, the number of threads, and whom to tell of pairs that are done.
     """
     parts, before, total = [], 0, view.num_pairs
-    for batch in view.batches(min_matches, without):
+    for batch in view.batches(min_matches, without, threads=clock.threads):
 
         def advance(done: int, before: int = before) -> None:
             clock.advance(before + done, total)

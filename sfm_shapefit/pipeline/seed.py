@@ -82,7 +82,7 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
             bundle, points = adjust_seed(run)
             posed, images = bundle.images, images.updated(bundle.images)
         else:
-            points = triangulate(posed, links, options.structure, clock.advance)
+            points = triangulate(posed, links, options.structure, clock.advance, clock.threads)
         counts = PartnerCounts(images, view.num_keypoints, limit_px, state.source.fixed)
         partners = _count(links, images, counts)
         del links

@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.jit import inner_kernel, kernel, mix_bits
 from sfm_shapefit.base.scipy_parts import expit, logit
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -47,6 +48,7 @@ _LAST_SWEEPS = 24  # sweeps on the last rung; messages have to settle there
 _DAMPING = 0.4  # share of a message that stays; undamped ones swing on dense graphs
 _MOST_PER_PAIR = 64  # triangles that a pair draws; 16 cost .001 of the area under the curve
 _MOST_TRIANGLES = 2_000_000  # triangles of a graph, about; 100 bytes each
+_TRIANGLES_WORTH_THREADS = 20_000  # triangles; a sweep over fewer is done before a thread has begun
 _FIT_TRIANGLES = 100_000  # triangles that the histogram is fitted to; more change no third digit
 _FIT_ROUNDS = 60  # rounds of expectation maximization; shares of neighboring levels part slowly
 _RANDOM_TRIANGLES = 50_000  # triangles that normalize the ratio; it is good to 10 % at the last level
@@ -82,8 +84,8 @@ class _Shapes:
     """Angle by which they fail to close in their plane, radians."""
 
 
-def weigh_by_triangles(graph: ViewGraph) -> TriangleEvidence:
-    """Return what the triangles of a graph say of its pairs."""
+def weigh_by_triangles(graph: ViewGraph, threads: int = 1) -> TriangleEvidence:
+    """Return what the triangles of a graph say of its pairs, which threads share."""
     sides, products = _draw_triangles(graph)
     m, d = graph.num_edges, graph.dimension
     if len(sides) == 0:
@@ -100,7 +102,9 @@ def weigh_by_triangles(graph: ViewGraph) -> TriangleEvidence:
         ratio = _ratio(shapes, tau, d) * norms[rung]
         last = rung == len(_RUNGS_RAD) - 1
         for _ in range(_LAST_SWEEPS // _SWEEPS if last else 1):
-            _sweep(sides, above + rest * ratio, float(logit(prior)), _SWEEPS, messages, log_odds)
+            weights = above + rest * ratio
+            for _ in range(_SWEEPS):
+                _sweep(sides, weights, float(logit(prior)), messages, log_odds, threads)
             found = float(np.mean(expit(log_odds + logit(prior))))
             prior = float(np.clip(0.5 * (prior + found), *_PRIORS))
         if level >= 0:
@@ -230,24 +234,36 @@ def _probability(log_odds: float) -> float:
     return 1.0 / (1.0 + math.exp(-min(max(log_odds, -30.0), 30.0)))
 
 
-@kernel
-def _sweep(sides: Any, ratio: Any, prior: float, sweeps: int, messages: Any, log_odds: Any) -> None:
+def _sweep(
+    sides: IntArray, ratio: FloatArray, prior: float, messages: FloatArray, log_odds: FloatArray, threads: int
+) -> None:
     """Send the messages (k, 3) of all triangles again, and write what they say together, (m,).
 
-    `prior` is in log odds. Within a sweep all messages answer those of the sweep before.
+    `prior` is in log odds. All messages answer those of the sweep before, of which `log_odds` is the sum.
     """
-    for sweep in range(sweeps + 1):
-        log_odds[:] = 0.0
-        for t in range(len(sides)):
-            for q in range(3):
-                log_odds[sides[t, q]] += messages[t, q]
-        if sweep == sweeps:
-            break
-        for t in range(len(sides)):
-            a = _probability(prior + log_odds[sides[t, 0]] - messages[t, 0])
-            b = _probability(prior + log_odds[sides[t, 1]] - messages[t, 1])
-            c = _probability(prior + log_odds[sides[t, 2]] - messages[t, 2])
-            excess = ratio[t] - 1.0
-            for q, others in ((0, b * c), (1, c * a), (2, a * b)):
-                message = np.log1p(others * excess)
-                messages[t, q] = _DAMPING * messages[t, q] + (1.0 - _DAMPING) * message
+    threads = threads if len(sides) > _TRIANGLES_WORTH_THREADS else 1
+    in_ranges(threads, len(sides), _answer, sides, (ratio, prior), messages, log_odds)
+    _add_up(sides, messages, log_odds)
+
+
+@kernel
+def _add_up(sides: Any, messages: Any, log_odds: Any) -> None:
+    """Write the sum of the messages to each pair."""
+    log_odds[:] = 0.0
+    for t in range(len(sides)):
+        for q in range(3):
+            log_odds[sides[t, q]] += messages[t, q]
+
+
+@kernel
+def _answer(begin: int, end: int, sides: Any, odds: Any, messages: Any, log_odds: Any) -> None:
+    """Write the messages of the triangles begin..end-1, by their own odds (k,) and those of all pairs."""
+    ratio, prior = odds
+    for t in range(begin, end):
+        a = _probability(prior + log_odds[sides[t, 0]] - messages[t, 0])
+        b = _probability(prior + log_odds[sides[t, 1]] - messages[t, 1])
+        c = _probability(prior + log_odds[sides[t, 2]] - messages[t, 2])
+        excess = ratio[t] - 1.0
+        for q, others in ((0, b * c), (1, c * a), (2, a * b)):
+            message = np.log1p(others * excess)
+            messages[t, q] = _DAMPING * messages[t, q] + (1.0 - _DAMPING) * message

@@ -98,7 +98,7 @@ def solve_reweighted(
     found = search.climb(usual, mixture)
     few = _FEW if found is None or measured.graph.num_edges > PAIRS_AT_SCALE else _FEW_OF_MOVED
     if (mixture if found is None else found.mixture).shares[0] < few:
-        from_triangles = search.follow(weigh_by_triangles(measured.graph))
+        from_triangles = search.follow(weigh_by_triangles(measured.graph, options.num_threads()))
         if found is None or from_triangles.mixture.evidence > found.mixture.evidence:
             found = from_triangles
     if found is None or found.mixture.evidence <= max(_more(mixture.evidence), 0.0):
@@ -109,7 +109,7 @@ def solve_reweighted(
 def solve_at_triangles(measured: MeasuredGraph, options: SolverOptions) -> Reweighted:
     """Return ShapeFit at the posteriors that the triangles of a graph give its pairs, certified."""
     graph = measured.graph
-    triangles = weigh_by_triangles(graph)
+    triangles = weigh_by_triangles(graph, options.num_threads())
     weighted = graph.with_weights(graph.weights * np.maximum(triangles.posterior, _LEAST_WEIGHT))
     solved = solve(weighted, options, groups=measured.groups)
     mixture = fit_mixture(measured, solved.locations)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, normalized
@@ -28,6 +27,7 @@ MAX_POINTS = 20_000
 # would shrink the rest, and are left out.
 _FAR_POINT = 4.0
 _FRUSTUM_SHARE = 0.4  # depth of a frustum over the median distance between neighbors; frusta stay apart
+_MEASURED = 200  # positions, at most twice as many; the median distance to their neighbors stands for all
 _FRUSTUM_OF_EXTENT = (0.008, 0.05)  # limits of the depth, as shares of the extent; frusta stay visible
 _HALF_SIZES = (0.15, 1.2)  # limits of half a picture's side over its focal length; a fisheye has no pyramid
 _FEWEST_FITTED = 3  # common centers; fewer fix no similarity
@@ -374,7 +374,8 @@ def _frustum_depth(positions: FloatArray) -> float:
         return 1.0
     low, high = np.quantile(positions, [0.05, 0.95], axis=0)
     extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
-    distances = np.asarray(cKDTree(positions).query(positions, k=2)[0])
+    some = positions[:: max(len(positions) // _MEASURED, 1)]
+    apart = [np.partition(np.linalg.norm(positions - own, axis=1), 1)[1] for own in some]
     smallest, largest = _FRUSTUM_OF_EXTENT
-    wanted = _FRUSTUM_SHARE * float(np.median(distances[:, 1]))
+    wanted = _FRUSTUM_SHARE * float(np.median(apart))
     return float(np.clip(wanted, smallest * extent, largest * extent))

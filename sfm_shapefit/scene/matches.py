@@ -26,7 +26,7 @@ from sfm_shapefit.base.arrays import (
     hand_back_memory,
     rows_of_parts,
 )
-from sfm_shapefit.base.executors import Advance, nobody
+from sfm_shapefit.base.executors import Advance, made_ahead, nobody
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
@@ -239,7 +239,11 @@ class View:
         return self.matches.keypoints(self.images.names[image])
 
     def batches(
-        self, min_matches: int = 1, without: IntArray | None = None, advance: Advance = nobody
+        self,
+        min_matches: int = 1,
+        without: IntArray | None = None,
+        advance: Advance = nobody,
+        threads: int = 1,
     ) -> Iterator[MatchBatch]:
         """Yield the matches with rays in world axes, in batches; few matches are kept with these.
 
@@ -247,6 +251,7 @@ class View:
             min_matches: pairs with fewer are left out.
             without: (m, 2) pairs that are left out, too, whatever the order of their images.
             advance: hears of the pairs that are done, while batches are consumed, and of their number.
+            threads: if several, another one makes the next batch while a batch is consumed.
 
         Raises:
             InputError: as `Matches.read`.
@@ -259,6 +264,8 @@ class View:
         found = self._batches(np.flatnonzero(wanted), min_matches)
         if self.reading.keeps and self.num_matches <= KEPT_MATCHES and without is None:
             found = iter(self._kept.setdefault(min_matches, list(found)))
+        elif self.reading.keeps:
+            found = made_ahead(threads, found)
         return self._tell(found, advance)
 
     def links(

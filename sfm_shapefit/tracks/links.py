@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, Lists, rows_of_parts
+from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.tracks.joining import number_trees, sampson_px, write_ray
@@ -136,7 +137,7 @@ class MatchedKeypoints:
             matches=row_of[self.matches[chosen[self.matches].all(axis=1)]],
         )
 
-    def join(self, poses: CameraPoses, limit_px: float) -> JoinedRows:
+    def join(self, poses: CameraPoses, limit_px: float, threads: int = 1) -> JoinedRows:
         """Return the connected components under the matches that agree with the poses.
 
         A wrong match would join two tracks; nearly all wrong ones miss their epipolar line.
@@ -144,11 +145,12 @@ class MatchedKeypoints:
         Args:
             poses: of the cameras.
             limit_px: largest Sampson error of a match that joins.
+            threads: number of threads to share the matches among; they are joined by one.
         """
         parents = np.arange(len(self.cameras), dtype=np.int32)
         given = self.on_plane, self.cameras, poses.rotations, poses.centers, poses.focal_lengths_px, limit_px
         for first in range(0, len(self.matches), _MATCHES_A_SLICE):
-            _join(self.matches[first : first + _MATCHES_A_SLICE], *given, parents)
+            _join(self.matches[first : first + _MATCHES_A_SLICE], given, parents, threads)
         track = number_trees(parents, np.arange(len(parents), dtype=np.int32))
         del parents  # before what orders the keypoints, which is larger
         rows, lengths = np.argsort(track, kind="stable"), np.bincount(track)
@@ -169,14 +171,29 @@ class MatchedKeypoints:
         )
 
 
-@kernel
-def _join(
-    matches: Any, on_plane: Any, cameras: Any, rotations: Any, centers: Any, focal_lengths_px: Any,
-    limit_px: float, parents: Any,
-) -> None:  # fmt: skip
+def _join(matches: npt.NDArray[np.integer], given: Any, parents: Int32Array, threads: int) -> None:
     """Join the keypoints of the matches that agree with the poses."""
-    u, v, d = np.empty((3, 3))
+    agree = np.empty(len(matches), dtype=np.bool_)
+    in_ranges(threads, len(matches), _find_agreeing, matches, agree, *given)
+    _merge(matches, agree, parents)
+
+
+@kernel
+def _merge(matches: Any, chosen: Any, parents: Any) -> None:
+    """Join the keypoints of the chosen matches."""
     for m in range(len(matches)):
+        if chosen[m]:
+            merge_sets(parents, matches[m, 0], matches[m, 1])
+
+
+@kernel
+def _find_agreeing(
+    begin: int, end: int, matches: Any, agree: Any, on_plane: Any, cameras: Any, rotations: Any,
+    centers: Any, focal_lengths_px: Any, limit_px: float,
+) -> None:  # fmt: skip
+    """Write which of the matches begin..end-1 agree with the poses."""
+    u, v, d = np.empty((3, 3))
+    for m in range(begin, end):
         k, other = matches[m, 0], matches[m, 1]
         i, j = cameras[k], cameras[other]
         square = 0.0
@@ -188,5 +205,4 @@ def _join(
         # Rays are made as they are needed: to hold those of all keypoints would take the most memory.
         write_ray(on_plane[k], rotations[i], u)
         write_ray(on_plane[other], rotations[j], v)
-        if sampson_px(u, v, d, 2.0 / (focal_lengths_px[i] + focal_lengths_px[j])) <= limit_px:
-            merge_sets(parents, k, other)
+        agree[m] = sampson_px(u, v, d, 2.0 / (focal_lengths_px[i] + focal_lengths_px[j])) <= limit_px

@@ -17,17 +17,20 @@ for the middle point.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.tracks.joining import write_ray
 from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
 
 # Observations between which Python can be interrupted: about 0.1 s.
 _SLICE = 100_000
+_SLICES_A_THREAD = 4  # slices of tracks at least, so that one whose tracks are long holds up few
 _PAIRS = 15  # pairs of observations that are tried for each point; all of six observations
 _STEPS = 5  # Gauss-Newton steps for a point; they begin within the limit of its observations
 _STILL = 1e-9  # length of a step over the distance of the point; the steps end with a shorter one
@@ -75,17 +78,21 @@ class TriangulatedPoints:
         return TriangulatedPoints(points=self.points[kept], tracks=self.tracks[kept], points_seen=place[seen])
 
 
-def triangulate_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: PointLimits) -> TriangulatedPoints:
+def triangulate_tracks(
+    tracks: ObservedTracks, poses: CameraPoses, limits: PointLimits, threads: int = 1
+) -> TriangulatedPoints:
     """Return the points of tracks; the same bits whatever else is triangulated with them.
 
     Args:
         tracks: observations; those without a ray ahead are of no point.
         poses: of the cameras that the tracks' observations index.
         limits: what a point must satisfy.
+        threads: number of threads to share the tracks among.
     """
     lengths = tracks.lengths()
     seen = np.full(len(tracks.cameras), -1)
-    points = np.empty((int((lengths // max(limits.min_length, 2)).sum()), 3))
+    room = np.append(0, np.cumsum(lengths // max(limits.min_length, 2)))  # for the points of each track
+    points = np.empty((int(room[-1]), 3))
     track_of = np.empty(len(points), dtype=np.int64)
     figures = np.array(
         [limits.max_error_px**2, math.cos(math.radians(limits.min_angle_deg)), limits.min_length]
@@ -95,11 +102,18 @@ def triangulate_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: Point
         tracks.offsets, tracks.cameras, tracks.on_plane, poses.rotations, poses.centers,
         poses.focal_lengths_px, poses.images, figures, most, int(lengths.max(initial=0)),
     )  # fmt: skip
-    cuts = np.searchsorted(tracks.offsets, np.arange(0, len(seen), _SLICE)[1:]).tolist()
-    count = 0
-    for begin, end in zip([0, *cuts], [*cuts, tracks.num_tracks], strict=True):
-        count = _triangulate(begin, end, count, given, points, track_of, seen)
-    return TriangulatedPoints(points=points[:count], tracks=track_of[:count], points_seen=seen)
+    number = max(len(seen) // _SLICE, _SLICES_A_THREAD * threads if threads > 1 else 1)
+    cuts = np.searchsorted(tracks.offsets, np.arange(1, number) * len(seen) // number).tolist()
+    slices = list(pairwise([0, *cuts, tracks.num_tracks]))
+
+    def fill(own: tuple[int, int]) -> IntArray:
+        first = int(room[own[0]])
+        return np.arange(first, _triangulate(*own, first, given, points, track_of, seen))
+
+    kept = np.concatenate(list(in_threads(threads, fill, slices)))
+    place = np.full(len(points) + 1, -1)
+    place[kept] = np.arange(len(kept))
+    return TriangulatedPoints(points=points[kept], tracks=track_of[kept], points_seen=place[seen])
 
 
 def joining_limits_px(threshold_px: float, widest_px: float) -> Iterator[float]:
@@ -114,7 +128,11 @@ def joining_limits_px(threshold_px: float, widest_px: float) -> Iterator[float]:
 
 
 def triangulate_matches(
-    matched: MatchedKeypoints, poses: CameraPoses, limits: PointLimits, threshold_px: float
+    matched: MatchedKeypoints,
+    poses: CameraPoses,
+    limits: PointLimits,
+    threshold_px: float,
+    threads: int = 1,
 ) -> tuple[ObservedTracks, TriangulatedPoints]:
     """Return the points of matches, and a track for each of what it is seen by.
 
@@ -127,17 +145,21 @@ def triangulate_matches(
         poses: of their cameras.
         limits: what a point must satisfy.
         threshold_px: the pixel threshold; the widest error of a match is `limits.max_error_px`.
+        threads: number of threads to share matches and tracks among.
     """
-    joined = matched.join(poses, limits.max_error_px)
+    place = poses, limits, threads
+    joined = matched.join(poses, limits.max_error_px, threads)
     is_chain = np.diff(joined.offsets) > _CHAIN * _count_images(joined, poses.images[matched.cameras])
     is_left: BoolArray = np.zeros(len(matched.cameras), dtype=np.bool_)
     is_left[joined.subset(np.flatnonzero(is_chain)).rows] = True
-    parts = [_triangulate_joined(matched, joined.subset(np.flatnonzero(~is_chain)), poses, limits)]
+    parts = [_triangulate_joined(matched, joined.subset(np.flatnonzero(~is_chain)), *place)]
+    left, rows = matched, np.arange(len(is_left))
     for limit_px in joining_limits_px(threshold_px, limits.max_error_px) if is_chain.any() else ():
-        rows, left = np.flatnonzero(is_left), matched.among(is_left)
-        points, seen = _triangulate_joined(left, left.join(poses, limit_px), poses, limits)
+        left, rows = left.among(is_left), rows[is_left]
+        points, seen = _triangulate_joined(left, left.join(poses, limit_px, threads), *place)
         parts.append((points, JoinedRows(seen.offsets, rows[seen.rows])))
-        is_left[rows[seen.rows]] = False
+        is_left = np.ones(len(rows), dtype=np.bool_)
+        is_left[seen.rows] = False
     lengths = np.concatenate([np.diff(seen.offsets) for _, seen in parts])
     tracks = JoinedRows(np.append(0, np.cumsum(lengths)), np.concatenate([seen.rows for _, seen in parts]))
     every = np.arange(len(lengths))
@@ -157,10 +179,10 @@ def _count_images(joined: JoinedRows, images: IntArray) -> IntArray:
 
 
 def _triangulate_joined(
-    matched: MatchedKeypoints, joined: JoinedRows, poses: CameraPoses, limits: PointLimits
+    matched: MatchedKeypoints, joined: JoinedRows, poses: CameraPoses, limits: PointLimits, threads: int
 ) -> tuple[FloatArray, JoinedRows]:
     """Return the points (k, 3) of joined keypoints, and the rows that see each."""
-    found = triangulate_tracks(matched.observed(joined), poses, limits)
+    found = triangulate_tracks(matched.observed(joined), poses, limits, threads)
     return found.points, joined.of_points(found.points_seen)
 
 

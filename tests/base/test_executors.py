@@ -6,7 +6,7 @@ from threading import Event, get_ident
 import pytest
 
 from sfm_shapefit.base import executors
-from sfm_shapefit.base.executors import WorkerError, answers, in_threads
+from sfm_shapefit.base.executors import WorkerError, answers, in_ranges, in_threads, made_ahead
 
 
 def square(number):
@@ -25,6 +25,36 @@ def test_threads_answer_in_order_and_a_single_one_is_the_callers(threads):
     found = in_threads(threads, lambda task: (seen.add(get_ident()), square(task))[1], range(100))
     assert list(found) == [k * k for k in range(100)]
     assert (get_ident() in seen) == (threads <= 1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 100])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_ranges_fill_each_item_once(threads, count):
+    filled = [0] * count
+
+    def fill(begin, end, by):
+        for k in range(begin, end):
+            filled[k] += by
+
+    in_ranges(threads, count, fill, 2)
+    assert filled == [2] * count
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_one_item_is_made_while_another_is_used(threads):
+    made = []
+    for k in made_ahead(threads, (made.append(k) or k for k in range(20))):
+        assert len(made) <= k + threads
+    assert made == list(range(20))
+
+    def failing():
+        yield 1
+        raise ValueError("damaged")
+
+    items = made_ahead(threads, failing())
+    assert next(items) == 1
+    with pytest.raises(ValueError, match="damaged"):
+        next(items)
 
 
 def test_tasks_are_made_only_a_few_ahead_of_the_answers(monkeypatch):

@@ -9,8 +9,8 @@ from sfm_shapefit.laplacian import superlu
 from tests.program import run_python
 
 SCIPY = {"scipy.special", "scipy.linalg", "scipy.sparse", "scipy.spatial"}
-HEAVY = SCIPY | {"pydantic", "rich", "cvxpy", "multiprocessing.connection", "sfm_shapefit.report"}
-LOCATE = ["locate", "data_synthetic/courtyard/sparse/0", "{out}", "--quiet", "--no-report"]
+HEAVY = SCIPY | {"pydantic", "rich", "cvxpy", "multiprocessing.connection"}
+LOCATE = ["locate", "data_synthetic/courtyard/sparse/0", "{out}", "--quiet", "--threads", "1"]
 
 
 def matrix(n=40):

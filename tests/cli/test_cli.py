@@ -573,6 +573,16 @@ def test_a_folder_without_a_model_is_refused_before_what_reads_models_is_loaded(
     assert not {"numba", "pycolmap", "scipy"} & {line.split("|")[-1].strip() for line in loaded}
 
 
+@pytest.mark.parametrize("command", [("map", RING / "database.db"), ("locate", COURTYARD / "sparse" / "0")])
+def test_models_and_tables_are_the_same_to_the_byte_for_any_number_of_threads(command, tmp_path):
+    for threads in (1, 3):
+        run(*command, tmp_path / str(threads), "--threads", threads, "--no-report", code=0)
+    files = [file for file in (tmp_path / "1").rglob("*") if file.suffix in {".bin", ".csv"}]
+    assert len(files) >= 7
+    for file in files:
+        assert file.read_bytes() == (tmp_path / "3" / file.relative_to(tmp_path / "1")).read_bytes(), file
+
+
 def test_a_file_in_the_place_of_out_is_only_swapped_where_the_command_takes_files(ring_run, tmp_path):
     path = tmp_path / "transforms.json"
     path.write_text("{}\n")

@@ -63,7 +63,8 @@ def test_a_triangle_tells_its_side_what_the_model_says_to_the_last_digit():
     directions = np.array([[1.0, 0.1, 0.0], [-0.4, 0.9, 0.02], [-0.5, -0.9, 0.01]])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     ratio, messages, log_odds = np.array([9.0]), np.zeros((1, 3)), np.zeros(3)
-    module._sweep(np.array([[0, 1, 2]]), ratio, np.log(0.25 / 0.75), 200, messages, log_odds)
+    for _ in range(200):
+        module._sweep(np.array([[0, 1, 2]]), ratio, np.log(0.25 / 0.75), messages, log_odds, 1)
     # The cavity is the prior alone: a side in no other triangle hears nothing back of what it said itself.
     np.testing.assert_allclose(log_odds, np.log1p(0.25**2 * 8.0))
 

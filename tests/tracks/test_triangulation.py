@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.adjustment.solve import adjust, choose_loss_scale_px
-from sfm_shapefit.tracks import triangulation
 from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.thin_tracks import choose_thin_tracks
 from sfm_shapefit.tracks.triangulation import (
@@ -148,13 +147,13 @@ def test_what_cannot_be_a_point_is_none(what):
     assert (found.points_seen < len(found.points)).all()
 
 
-def test_slices_and_neighbors_change_no_bit(monkeypatch):
+def test_threads_and_neighbors_change_no_bit():
     tracks, poses, _ = made(noise_px=0.5)
     whole = triangulate_tracks(tracks, poses, LIMITS)
-    monkeypatch.setattr(triangulation, "_SLICE", 37)
-    sliced = triangulate_tracks(tracks, poses, LIMITS)
-    np.testing.assert_array_equal(whole.points, sliced.points)
-    np.testing.assert_array_equal(whole.points_seen, sliced.points_seen)
+    for threads in (2, 3, 7):
+        shared = triangulate_tracks(tracks, poses, LIMITS, threads)
+        np.testing.assert_array_equal(whole.points, shared.points)
+        np.testing.assert_array_equal(whole.points_seen, shared.points_seen)
     part = triangulate_tracks(tracks.subset(np.arange(100, 200)), poses, LIMITS)
     np.testing.assert_array_equal(part.points, whole.points[whole.tracks >= 100])
     assert len(triangulate_tracks(tracks.subset(np.arange(0)), poses, LIMITS).points) == 0

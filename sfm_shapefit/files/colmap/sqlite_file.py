@@ -192,8 +192,9 @@ def _readonly_connection(path: Path) -> Iterator[sqlite3.Connection]:
             in_wal_mode = _WAL_VERSION in header[18:20]
             target, mode = path, "mode=ro&immutable=1" if in_wal_mode else "mode=ro"
         uri = f"file://{quote(os.fsencode(target.absolute()))}?{mode}"
+        how: dict[str, Any] = {"isolation_level": None, "check_same_thread": False}  # one at a time uses it
         connection = stack.enter_context(
-            closing(sqlite3.connect(uri, uri=True, timeout=_LOCK_TIMEOUT_S, isolation_level=None))
+            closing(sqlite3.connect(uri, uri=True, timeout=_LOCK_TIMEOUT_S, **how))
         )
         connection.text_factory = lambda raw: raw.decode("utf-8", "surrogateescape")
         for limit, value in _LIMITS.items():
