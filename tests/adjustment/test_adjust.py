@@ -23,7 +23,7 @@ from sfm_shapefit.adjustment.solve import Ending, adjust, frames_not_gained, rep
 from sfm_shapefit.adjustment.solve import linearize_all as every
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity
-from sfm_shapefit.laplacian.cholesky import allocate_factor
+from sfm_shapefit.laplacian.factor import allocate_factor
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.lens import Lens
