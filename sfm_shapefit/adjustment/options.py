@@ -6,7 +6,7 @@ from typing import Literal
 
 from sfm_shapefit.base.settings import Settings, explained, option
 
-LinearSolver = Literal["auto", "dense", "sparse"]
+LinearSolver = Literal["auto", "dense", "sparse", "iterative"]
 
 
 @explained

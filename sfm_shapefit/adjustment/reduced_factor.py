@@ -14,8 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from sfm_shapefit.adjustment.iterative_factor import UNDETERMINED, IterativeFactor
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.schur import ReducedSystem
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
@@ -25,8 +27,8 @@ from sfm_shapefit.base.scipy_parts import dpotrf, dpotri, dpotrs
 from sfm_shapefit.laplacian.approximate import conjugate_gradients
 from sfm_shapefit.laplacian.dense import PIVOT_TOLERANCE
 from sfm_shapefit.laplacian.factor import Factor, FactorPlan, allocate_factor, analyze
+from sfm_shapefit.laplacian.operators import Workers
 
-_UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"
 _DENSE_LIMIT = 3000  # unknowns: 500 free cameras
 # Residual of a solve, relative to its right-hand side, and products that may lead there; a factor of 64 bits
 # takes as long as 25 to 40 of them.
@@ -46,21 +48,39 @@ class ReducedFactor(Protocol):
         """Return the solutions (N, 6, r) for right-hand sides (N, 6, r); 0 for what is no unknown."""
         ...
 
-    def inverse_blocks(self) -> FloatArray:
-        """Return the diagonal blocks of the inverse, (N, 6, 6); 0 for what is no unknown."""
-        ...
-
     def give_back(self) -> None:
         """Give up what is large, until the next system."""
 
 
-def choose_factor(
-    layout: Layout, options: AdjustmentOptions, dtype: npt.DTypeLike = np.float64
+class InvertedFactor(ReducedFactor, Protocol):
+    """One that knows entries of the inverse."""
+
+    def inverse_blocks(self) -> FloatArray:
+        """Return the diagonal blocks of the inverse, (N, 6, 6); 0 for what is no unknown."""
+        ...
+
+
+def choose_factor(layout: Layout, options: AdjustmentOptions) -> InvertedFactor:
+    """Return an empty factor as the options ask, dense without unknowns; sparse where steps are iterative."""
+    is_dense = _is_dense(layout, options)
+    return DenseFactor.plan(layout) if is_dense else SparseFactor.of(layout, options.threads, np.float64)
+
+
+def choose_solver(
+    problem: AdjustmentProblem, layout: Layout, options: AdjustmentOptions, workers: Workers
 ) -> ReducedFactor:
-    """Return an empty factor as the options ask, dense without unknowns; `dtype` is that of a sparse one."""
-    dense_up_to = {"auto": _DENSE_LIMIT, "dense": np.inf, "sparse": 0}[options.linear_solver]
-    dense = layout.num_unknowns <= dense_up_to
-    return DenseFactor.plan(layout) if dense else SparseFactor.of(layout, options.threads, dtype)
+    """Return what the systems of steps are solved with, as the options ask."""
+    if _is_dense(layout, options):
+        return DenseFactor.plan(layout)
+    if options.linear_solver == "iterative":
+        return IterativeFactor(problem, layout, workers)
+    return SparseFactor.of(layout, options.threads, np.float32)
+
+
+def _is_dense(layout: Layout, options: AdjustmentOptions) -> bool:
+    """Return whether a factor is dense."""
+    most = {"auto": _DENSE_LIMIT, "dense": np.inf}.get(options.linear_solver, 0)
+    return layout.num_unknowns <= most
 
 
 @dataclass(slots=True, eq=False)
@@ -151,7 +171,7 @@ class SparseFactor:
         if self.factor.refactor_blocks(self.pair_nodes, diagonal, system.pairs[:, :b, :b]):
             return
         if is_full:
-            raise UnsolvableError(_UNDETERMINED)
+            raise UnsolvableError(UNDETERMINED)
         self._refactor_in_full(system)
 
     def solve(self, right: FloatArray) -> FloatArray:
@@ -184,9 +204,7 @@ class SparseFactor:
     def _apply(self, x: FloatArray) -> FloatArray:
         """Return the product of the system with x (N, b)."""
         assert self.system is not None
-        out = np.empty_like(x, order="C")
-        _multiply(self.pair_nodes, self.system.diagonal, self.system.pairs, np.ascontiguousarray(x), out)
-        return out
+        return self.system.times(self.pair_nodes, x)
 
     def inverse_blocks(self) -> FloatArray:
         """Return the selected entries of the inverse."""
@@ -200,7 +218,7 @@ def _refuse_singular(failed: bool, pivots: FloatArray) -> None:
     """Raise UnsolvableError if the factorisation failed or a relative pivot is rounding."""
     least = float(pivots.min(initial=1.0))
     if failed or not least > PIVOT_TOLERANCE * np.finfo(np.float64).eps:
-        raise UnsolvableError(_UNDETERMINED)
+        raise UnsolvableError(UNDETERMINED)
 
 
 @kernel
@@ -217,23 +235,3 @@ def _fill(rows: Any, pair_nodes: Any, diagonal: Any, pairs: Any, columns: Any) -
             for a in range(SLOTS):
                 if rows[i, c] >= 0 and rows[j, a] >= 0:
                     columns[rows[i, c], rows[j, a]] = pairs[k, c, a]
-
-
-@kernel
-def _multiply(pair_nodes: Any, diagonal: Any, pairs: Any, x: Any, out: Any) -> None:
-    """Write the product of a symmetric matrix of blocks with x (N, b); blocks may be larger than b."""
-    b = x.shape[1]
-    for i in range(len(x)):
-        for a in range(b):
-            total = 0.0
-            for c in range(b):
-                total += diagonal[i, a, c] * x[i, c]
-            out[i, a] = total
-    for k in range(len(pair_nodes)):
-        i, j = pair_nodes[k, 0], pair_nodes[k, 1]
-        for a in range(b):
-            total, own = 0.0, x[i, a]
-            for c in range(b):
-                total += pairs[k, a, c] * x[j, c]
-                out[j, c] += pairs[k, a, c] * own
-            out[i, a] += total
