@@ -50,7 +50,7 @@ _SIMILARITY = 7  # unknowns of a group
 # Shares of the diagonal that are added to it, in turn until there is a factor: of 32 bits for a block, as its
 # rounding only costs iterations, and of 64 for the coarse system, where the least motions are.
 _RIDGES_OF_BLOCKS, _RIDGES_OF_COARSE = (1e-7, 1e-5, 1e-3, 1e-1), (1e-13, 1e-11, 1e-9, 1e-7)
-# The last iteration adds at most such a share of the decrease promised, over the number of iterations. Iterations
+# The last iteration adds at most such a share of the decrease promised, over the number of iterations. They
 # cost little beside what a step is made of, and a bend shows in the last digits of the decrease alone.
 _ENOUGH, _MOST_ITERATIONS = 1e-8, 500
 

@@ -36,7 +36,7 @@ def make_wall(size=(SIDE, SIDE), *, models=("SIMPLE_RADIAL",), own_lenses=False,
     n = width * height
     places = np.stack([*np.divmod(np.arange(n), height)], axis=1) * 1.0
     centers = np.insert(places, 1, 0.0, axis=1) + 0.1 * rng.standard_normal((n, 3))
-    points = rng.uniform([0.0, 4.0, 0.0], [width - 1.0, 6.0, height - 1.0], (4 * n, 3))
+    points = rng.uniform([0.0, 4.0, 0.0], [width - 1.0, 6.0, height - 1.0], (6 * n, 3))
     near = np.linalg.norm(centers[:, None, ::2] - points[None, :, ::2], axis=2) < 2.5
     frames, seen = np.nonzero(near & (rng.random(near.shape) < 0.5))
     rig, cameras, count = Rig.of_single_cameras(n), frames, n
@@ -91,8 +91,8 @@ CASES = {
     "poses": (make_wall, {}),
     "held rotations": (make_wall, {"hold_rotations": True}),
     "fixed frames": (lambda: replace(make_wall(), fixed=np.arange(SIDE**2) % 80 == 0), {}),
-    "one lens": (lambda: make_wall(models=("OPENCV",)), FREE),
-    "three lenses": (lambda: make_wall(models=("PINHOLE", "SIMPLE_RADIAL", "RADIAL")), FREE),
+    "one lens": (make_wall, FREE),
+    "three lenses": (lambda: prior_on_lenses(make_wall(models=("PINHOLE", "SIMPLE_RADIAL", "OPENCV"))), FREE),
     "a lens each": (lambda: prior_on_lenses(make_wall(own_lenses=True)), FREE),
     "rigs": (lambda: make_wall(baseline=0.4), {}),
     "rotations weighted": (lambda: prior_on_rotations(make_wall()), {}),
@@ -105,22 +105,11 @@ def test_steps_by_conjugate_gradients_lead_to_the_minimum_of_a_factor(name):
     make, free = CASES[name]
     start = disturb(make(), np.random.default_rng(1), center=0.005, rotation_rad=5e-4, point=0.005)
     start = start if "hold_rotations" not in free else replace(start, rotations=make().rotations)
-    options = AdjustmentOptions(first_damping=1e-8, cost_tolerance=1e-12, **free)
+    options = AdjustmentOptions(first_damping=1e-8, cost_tolerance=1e-9, loss_scale_px=None, **free)
     by_factor, iteratively = (adjust(start, options, linear_solver=way) for way in ("sparse", "iterative"))
     assert iteratively.converged
     assert iteratively.iterations <= 2 * by_factor.iterations
     extent = np.ptp(by_factor.problem.centers, axis=0).max()
-    print(
-        name,
-        iteratively.iterations,
-        by_factor.iterations,
-        iteratively.cost,
-        by_factor.cost,
-        iteratively.ending,
-        np.abs(iteratively.problem.centers - by_factor.problem.centers).max() / extent,
-        by_factor.gradient_norm,
-        iteratively.gradient_norm,
-    )
     np.testing.assert_allclose(iteratively.problem.centers, by_factor.problem.centers, atol=1e-6 * extent)
 
 
@@ -144,11 +133,6 @@ def test_few_iterations_see_how_a_row_bends(rig, free):
         return float(np.vdot(x[:, :size], system.times(layout.pairs, x[:, :size])))
 
     exact, found = steps
-    print(
-        "ROW",
-        energy(found - exact) / energy(exact),
-        np.abs(found - exact)[:300, :3].max() / np.abs(exact)[:300, :3].max(),
-    )
     assert energy(found - exact) < 1e-4**2 * energy(exact)
     # Where a step ends, it promises the decrease that it takes.
     assert energy(found) == pytest.approx(float(np.vdot(found, system.right)), rel=1e-6)
