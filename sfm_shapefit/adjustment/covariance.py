@@ -25,7 +25,7 @@ from sfm_shapefit.adjustment.gauge import free_similarities, small_similarities
 from sfm_shapefit.adjustment.layout import SLOTS, Layout, lay_out
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
+from sfm_shapefit.adjustment.reduced_factor import InvertedFactor, ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points
 from sfm_shapefit.adjustment.solve import linearize_all, values_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
@@ -111,7 +111,7 @@ class GroundedSystem:
     """The reduced system at a minimum, made regular and factored, and the motions that nothing holds."""
 
     layout: Layout
-    factor: ReducedFactor
+    factor: InvertedFactor
     inverses: FloatArray
     """(k, 6) inverses of the points' blocks, packed."""
     free: FloatArray

@@ -7,7 +7,7 @@ from typing import Literal
 from sfm_shapefit.base.settings import Settings, explained, option
 from sfm_shapefit.base.threads import MAX_THREADS, count_threads
 
-LinearSolver = Literal["auto", "dense", "sparse"]
+LinearSolver = Literal["auto", "dense", "sparse", "iterative"]
 
 
 @explained

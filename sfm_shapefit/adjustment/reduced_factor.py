@@ -10,13 +10,15 @@ on 10,000 images. Where that does not lead there, the factor gets 64 bits, and k
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from sfm_shapefit.adjustment.iterative_factor import UNDETERMINED, IterativeFactor
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.schur import ReducedSystem
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
@@ -24,18 +26,11 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.scipy_parts import dpotrs
 from sfm_shapefit.laplacian.approximate import conjugate_gradients
-from sfm_shapefit.laplacian.cholesky import (
-    PIVOT_TOLERANCE,
-    CholeskyFactor,
-    allocate_factor,
-    analyze,
-    factor_by_strips,
-)
-from sfm_shapefit.laplacian.dense import blas_of, trsm
+from sfm_shapefit.laplacian.cholesky import factor_by_strips
+from sfm_shapefit.laplacian.dense import PIVOT_TOLERANCE, blas_of, trsm
+from sfm_shapefit.laplacian.factor import Factor, FactorPlan, allocate_factor, analyze
 from sfm_shapefit.laplacian.operators import Workers
-from sfm_shapefit.laplacian.selected import selected_inverse
 
-_UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"
 _DENSE_LIMIT = 3000  # unknowns: 500 free cameras
 _NODES_AT_ONCE = 32  # nodes whose columns of the inverse are solved for together, as one job of a thread
 # Residual of a solve, relative to its right-hand side, and products that may lead there; a factor of 64 bits
@@ -46,22 +41,58 @@ _RESIDUAL, _MOST_PRODUCTS = 1e-11, 40
 _RIDGE = 1e-7
 
 
-def choose_factor(
-    layout: Layout, options: AdjustmentOptions, dtype: npt.DTypeLike = np.float64
-) -> "ReducedFactor":
-    """Return an empty factor as the options ask, dense without unknowns; `dtype` is that of a sparse one."""
-    dense_up_to = {"auto": _DENSE_LIMIT, "dense": np.inf, "sparse": 0}[options.linear_solver]
-    dense = layout.num_unknowns <= dense_up_to
+class ReducedFactor(Protocol):
+    """Factors reduced systems of one structure, one after the other."""
+
+    def refactor(self, system: ReducedSystem) -> None:
+        """Take a system; raise UnsolvableError if it is not positive definite to working precision."""
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return the solutions (N, 6, r) for right-hand sides (N, 6, r); 0 for what is no unknown."""
+        ...
+
+    def give_back(self) -> None:
+        """Give up what is large, until the next system."""
+
+
+class InvertedFactor(ReducedFactor, Protocol):
+    """One that knows entries of the inverse."""
+
+    def inverse_blocks(self) -> FloatArray:
+        """Return the diagonal blocks of the inverse, (N, 6, 6); 0 for what is no unknown."""
+        ...
+
+
+def choose_factor(layout: Layout, options: AdjustmentOptions) -> InvertedFactor:
+    """Return an empty factor as the options ask, dense without unknowns; sparse where steps are iterative."""
+    is_dense = _is_dense(layout, options)
     return (
         DenseFactor.plan(layout, options.num_threads())
-        if dense
-        else SparseFactor.plan(layout, options.num_threads(), dtype)
+        if is_dense
+        else SparseFactor.of(layout, options.num_threads(), np.float64)
     )
+
+
+def choose_solver(
+    problem: AdjustmentProblem, layout: Layout, options: AdjustmentOptions, workers: Workers
+) -> ReducedFactor:
+    """Return what the systems of steps are solved with, as the options ask."""
+    if _is_dense(layout, options):
+        return DenseFactor.plan(layout, options.num_threads())
+    if options.linear_solver == "iterative":
+        return IterativeFactor(problem, layout, workers)
+    return SparseFactor.of(layout, options.num_threads(), np.float32)
+
+
+def _is_dense(layout: Layout, options: AdjustmentOptions) -> bool:
+    """Return whether a factor is dense."""
+    most = {"auto": _DENSE_LIMIT, "dense": np.inf}.get(options.linear_solver, 0)
+    return layout.num_unknowns <= most
 
 
 @dataclass(slots=True, eq=False)
 class DenseFactor:
-    """Factors reduced systems of one structure, one after the other: one dense matrix, its lower triangle."""
+    """One dense matrix, its lower triangle."""
 
     rows: IntArray
     """(N, 6) row of each slot, -1 if it is no unknown."""
@@ -135,43 +166,46 @@ class DenseFactor:
 class SparseFactor:
     """A multifrontal factor with a block for each node and each pair."""
 
-    factor: CholeskyFactor
+    plan: FactorPlan
+    block: int
+    """Slots of the largest node."""
+    dtype: npt.DTypeLike
+    """That of the factor, until 32 bits do not suffice."""
+    threads: int
     pair_nodes: IntArray
     """(P, 2)"""
     unknown: FloatArray
     """(N, 6) 1 where a slot is an unknown."""
+    factor: Factor | None = None
     system: ReducedSystem | None = None
     """What is factored, while the factor has 32 bits."""
 
     @classmethod
-    def plan(cls, layout: Layout, threads: int, dtype: npt.DTypeLike) -> "SparseFactor":
+    def of(cls, layout: Layout, threads: int, dtype: npt.DTypeLike) -> "SparseFactor":
         """Order the nodes and plan the factorisation."""
-        block = int(layout.active.any(axis=0).sum())
-        symbolic = analyze(layout.num_nodes, layout.pairs)
-        factor = allocate_factor(symbolic, block, dtype, threads=threads)
-        return cls(factor, layout.pairs, layout.active.astype(np.float64))
+        plan, block = analyze(layout.num_nodes, layout.pairs), int(layout.active.any(axis=0).sum())
+        return cls(plan, block, dtype, threads, layout.pairs, layout.active.astype(np.float64))
 
     def refactor(self, system: ReducedSystem) -> None:
         """Factor a system."""
-        if not len(self.factor.panels):
-            self._allocate(self.factor.dtype)
-        b, is_full = self.factor.block, self.factor.dtype == np.float64
+        if self.factor is None:
+            self.factor = allocate_factor(self.plan, self.block, self.dtype, threads=self.threads)
+        b, is_full = self.block, self.dtype == np.float64
         self.system, diagonal = None if is_full else system, system.diagonal[:, :b, :b].copy()
         np.einsum("naa->na", diagonal)[:] *= 1.0 if is_full else 1.0 + _RIDGE
         if self.factor.refactor_blocks(self.pair_nodes, diagonal, system.pairs[:, :b, :b]):
             return
         if is_full:
-            raise UnsolvableError(_UNDETERMINED)
+            raise UnsolvableError(UNDETERMINED)
         self._refactor_in_full(system)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve for right-hand sides (N, 6, r)."""
-        b = self.factor.block
-        out = np.zeros(right.shape)
-        if self.factor.dtype == np.float64:
+        b, out = self.block, np.zeros(right.shape)
+        assert self.factor is not None
+        if self.system is None:
             out[:, :b] = self.factor.solve(np.ascontiguousarray(right[:, :b]))
             return out * self.unknown[:, :, None]
-        assert self.system is not None
         for k in range(right.shape[2]):
             found = conjugate_gradients(
                 self._apply, self.factor, right[:, :b, k],
@@ -185,42 +219,31 @@ class SparseFactor:
 
     def _refactor_in_full(self, system: ReducedSystem) -> None:
         """Factor a system with 64 bits, as all that follow."""
-        self._allocate(np.float64)
+        self.factor, self.dtype = None, np.float64  # the memory goes before the next comes
         self.refactor(system)
 
-    def _allocate(self, dtype: npt.DTypeLike) -> None:
-        """Take another factor of the same plan."""
-        symbolic, block, threads = self.factor.symbolic, self.factor.block, self.factor.workers.threads
-        del self.factor  # before the next one
-        self.factor = allocate_factor(symbolic, block, dtype, threads=threads)
-
     def give_back(self) -> None:
-        """Give up the panels and the system."""
-        self.factor.panels, self.system = self.factor.panels[:0].copy(), None
+        """Give up the factor and the system."""
+        self.factor = self.system = None
 
     def _apply(self, x: FloatArray) -> FloatArray:
         """Return the product of the system with x (N, b)."""
         assert self.system is not None
-        out = np.empty_like(x, order="C")
-        _multiply(self.pair_nodes, self.system.diagonal, self.system.pairs, np.ascontiguousarray(x), out)
-        return out
+        return self.system.times(self.pair_nodes, x)
 
     def inverse_blocks(self) -> FloatArray:
         """Return the selected entries of the inverse."""
-        b = self.factor.block
-        out = np.zeros((*self.unknown.shape, SLOTS))
-        out[:, :b, :b] = selected_inverse(self.factor, self.pair_nodes).nodes
+        b, out = self.block, np.zeros((*self.unknown.shape, SLOTS))
+        assert self.factor is not None
+        out[:, :b, :b] = self.factor.selected_inverse(self.pair_nodes).nodes
         return out * self.unknown[:, :, None] * self.unknown[:, None, :]
-
-
-ReducedFactor = DenseFactor | SparseFactor
 
 
 def _refuse_singular(failed: bool, pivots: FloatArray) -> None:
     """Raise UnsolvableError if the factorisation failed or a relative pivot is rounding."""
     least = float(pivots.min(initial=1.0))
     if failed or not least > PIVOT_TOLERANCE * np.finfo(np.float64).eps:
-        raise UnsolvableError(_UNDETERMINED)
+        raise UnsolvableError(UNDETERMINED)
 
 
 @kernel
@@ -237,23 +260,3 @@ def _fill(rows: Any, pair_nodes: Any, diagonal: Any, pairs: Any, columns: Any) -
             for a in range(SLOTS):
                 if rows[i, c] >= 0 and rows[j, a] >= 0:
                     columns[rows[i, c], rows[j, a]] = pairs[k, c, a]
-
-
-@kernel
-def _multiply(pair_nodes: Any, diagonal: Any, pairs: Any, x: Any, out: Any) -> None:
-    """Write the product of a symmetric matrix of blocks with x (N, b); blocks may be larger than b."""
-    b = x.shape[1]
-    for i in range(len(x)):
-        for a in range(b):
-            total = 0.0
-            for c in range(b):
-                total += diagonal[i, a, c] * x[i, c]
-            out[i, a] = total
-    for k in range(len(pair_nodes)):
-        i, j = pair_nodes[k, 0], pair_nodes[k, 1]
-        for a in range(b):
-            total, own = 0.0, x[i, a]
-            for c in range(b):
-                total += pairs[k, a, c] * x[j, c]
-                out[j, c] += pairs[k, a, c] * own
-            out[i, a] += total

@@ -16,7 +16,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.residuals import NormalEquations
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.jit import kernel, subtract_block
 from sfm_shapefit.laplacian.operators import Workers
 
@@ -37,6 +37,12 @@ class ReducedSystem:
     """(N, 6)"""
     inverses: FloatArray
     """(k, 6) V_p^-1, packed as V."""
+
+    def times(self, pair_nodes: IntArray, x: FloatArray) -> FloatArray:
+        """Return the product with x (N, b), of the first b slots of each node."""
+        out = np.empty_like(x, order="C")
+        _multiply(pair_nodes, self.diagonal, self.pairs, np.ascontiguousarray(x), out)
+        return out
 
 
 def eliminate_points(
@@ -163,3 +169,23 @@ def _back_substitute(
         steps[p, 0] = -(v[0] * x + v[1] * y + v[2] * z)
         steps[p, 1] = -(v[1] * x + v[3] * y + v[4] * z)
         steps[p, 2] = -(v[2] * x + v[4] * y + v[5] * z)
+
+
+@kernel
+def _multiply(pair_nodes: Any, diagonal: Any, pairs: Any, x: Any, out: Any) -> None:
+    """Write the product of a symmetric matrix of blocks with x (N, b); blocks may be larger than b."""
+    b = x.shape[1]
+    for i in range(len(x)):
+        for a in range(b):
+            total = 0.0
+            for c in range(b):
+                total += diagonal[i, a, c] * x[i, c]
+            out[i, a] = total
+    for k in range(len(pair_nodes)):
+        i, j = pair_nodes[k, 0], pair_nodes[k, 1]
+        for a in range(b):
+            total, own = 0.0, x[i, a]
+            for c in range(b):
+                total += pairs[k, a, c] * x[j, c]
+                out[j, c] += pairs[k, a, c] * own
+            out[i, a] += total

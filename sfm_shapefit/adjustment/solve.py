@@ -14,7 +14,7 @@ from sfm_shapefit.adjustment.lone_points import settle_points
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import add_priors, sum_priors
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
+from sfm_shapefit.adjustment.reduced_factor import choose_solver
 from sfm_shapefit.adjustment.residuals import (
     NormalEquations,
     Values,
@@ -237,7 +237,7 @@ class _Run:
         self.workers = Workers(options.num_threads())
         self.layout = lay_out(problem, options)
         hand_back_memory()  # what the layout was made of goes before the largest arrays come
-        self.factor: ReducedFactor = choose_factor(self.layout, options, np.float32)
+        self.factor = choose_solver(problem, self.layout, options, self.workers)
         self.values, cost = self.settle(values_of(problem), _FIRST_SETTLING * options.settles_points)
         self.damping, self.growth = options.first_damping, 2.0
         self.costs = [cost]

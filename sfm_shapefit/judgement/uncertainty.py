@@ -42,9 +42,8 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import distances_in_spreads, median_spread
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.judgement.limits import FEW
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
-from sfm_shapefit.laplacian.selected import SelectedInverse, regauged, selected_inverse
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
+from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES, Factor, FactorPlan, analyze, factorize
+from sfm_shapefit.laplacian.selected import SelectedInverse, regauged
 from sfm_shapefit.solver.program import adjoint, differences
 
 # Shares of each block's trace, added in turn; loose nodes become large, finite.
@@ -146,7 +145,7 @@ def propagate(
     if plan.num_bytes(d) > max_bytes:
         return None
     factor = _grounded_factor(plan, terms)
-    inverse = selected_inverse(factor, edges)
+    inverse = factor.selected_inverse(edges)
     is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
     covariances, gauge = _fix_gauge(factor, inverse, locations, is_camera)
     if errors is not None:
@@ -190,7 +189,7 @@ def propagate_groups(
     if plan.num_bytes(d) > max_bytes:
         return None
     factor = factorize(plan, terms.ridged(_RIDGES[0]))
-    inverse = selected_inverse(factor, ends)
+    inverse = factor.selected_inverse(ends)
     null = np.tile(np.eye(d), (len(share), 1, 1))
     fixed = share[:, None, None] * null
     covariances = regauged(inverse.nodes, factor.solve, null, fixed)
@@ -205,7 +204,7 @@ def propagate_groups(
     )
 
 
-def _scale_sigma(factor: CholeskyFactor, centers: FloatArray, gauge: BoolArray) -> float:
+def _scale_sigma(factor: Factor, centers: FloatArray, gauge: BoolArray) -> float:
     """Return the relative standard deviation of the scale of groups at centers (B, d), read off some (B,)."""
     size = _gauge_pair(centers, gauge & (distances_in_spreads(centers, centers[gauge]) <= _FAR))[1][:, :, -1]
     return float(np.sqrt(max(float(np.vdot(size, factor.solve(size))), 0.0)))
@@ -235,7 +234,7 @@ def _right_side(edges: IntArray, pulls: FloatArray, errors: Iterable[FloatArray]
     return total
 
 
-def _moved(factor: CholeskyFactor, right: FloatArray, null: FloatArray, fixed: FloatArray) -> FloatArray:
+def _moved(factor: Factor, right: FloatArray, null: FloatArray, fixed: FloatArray) -> FloatArray:
     """Return S A^-1 of the right sides (n, d, s), in the gauge of N and F."""
     moved = factor.solve(right)
     drift = np.einsum("nak,nas->ks", fixed, moved)
@@ -244,7 +243,7 @@ def _moved(factor: CholeskyFactor, right: FloatArray, null: FloatArray, fixed: F
     return moved
 
 
-def _grounded_factor(plan: SymbolicFactor, terms: Information) -> CholeskyFactor:
+def _grounded_factor(plan: FactorPlan, terms: Information) -> Factor:
     """Factor H with its last camera grounded and the length of its longest baseline held."""
     longest = int(np.argmax(terms.lengths))
     held = np.trace(terms.blocks[longest]) * np.outer(terms.units[longest], terms.units[longest])
@@ -260,7 +259,7 @@ def _grounded_factor(plan: SymbolicFactor, terms: Information) -> CholeskyFactor
 
 
 def _fix_gauge(
-    factor: CholeskyFactor, inverse: SelectedInverse, locations: FloatArray, is_camera: BoolArray
+    factor: Factor, inverse: SelectedInverse, locations: FloatArray, is_camera: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return the covariances in the gauge of the cameras that are held, and which these are."""
     gauge = is_camera & (distances_in_spreads(locations, locations[is_camera]) <= _FAR)

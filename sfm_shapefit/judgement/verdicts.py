@@ -25,7 +25,7 @@ from sfm_shapefit.judgement.uncertainty import (
     propagate_groups,
     standard_deviations,
 )
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
+from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.placement.conditioning import Conditioning, LooseCameras, condition
 from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement, own_covariances
 from sfm_shapefit.solver.tied import largest_tied

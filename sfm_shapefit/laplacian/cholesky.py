@@ -33,13 +33,10 @@ from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import array_address, inner_kernel, kernel, multiply_in_lanes
-from sfm_shapefit.laplacian.dense import Blas, Block, blas_of, gemm, potrf, syrk, trsm
-from sfm_shapefit.laplacian.operators import Workers, adjacency, check_edges
-from sfm_shapefit.laplacian.ordering import Ordering, best_order
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorization
-
-PIVOT_TOLERANCE = 64.0
-"""Rounding units of the diagonal entry; smaller pivots count as zero."""
+from sfm_shapefit.laplacian.dense import PIVOT_TOLERANCE, Blas, Block, blas_of, gemm, potrf, syrk, trsm
+from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
 _LARGE_FRONT, _STRIP = (
     768,
@@ -79,8 +76,7 @@ class _Input(NamedTuple):
 class CholeskyFactor:
     """Numeric factor of one Laplacian: memory that `refactor` overwrites and `solve` reads."""
 
-    symbolic: SymbolicFactor
-    """The plan."""
+    plan: SymbolicFactor
     block: int
     """Size b of the blocks; 1 for the scalar graph Laplacian."""
     panels: npt.NDArray[Any]
@@ -110,7 +106,7 @@ class CholeskyFactor:
                 > 1) not rigid under these weights, or a weight is negative or not finite. The factor is
                 unusable then.
         """
-        plan, b = self.symbolic, self.block
+        plan, b = self.plan, self.block
         shape = (plan.num_edges,) if b == 1 else (plan.num_edges, b, b)
         if np.shape(weights) != shape:
             raise ValueError(f"weights have shape {np.shape(weights)}, this factor takes {shape}")
@@ -135,7 +131,7 @@ class CholeskyFactor:
             diagonal: (n, b, b) symmetric blocks of the nodes.
             off_diagonal: (m, b, b) blocks (i, j) of the edges (i, j).
         """
-        plan, b = self.symbolic, self.block
+        plan, b = self.plan, self.block
         self._diagonal[:] = diagonal[plan.permutation].reshape(-1, b * b)
         # Weights are subtracted, with the node that is eliminated first as the column.
         weights = -off_diagonal
@@ -145,7 +141,7 @@ class CholeskyFactor:
 
     def _input(self, weights: FloatArray) -> _Input:
         """Return what fronts are assembled from."""
-        plan, b = self.symbolic, self.block
+        plan, b = self.plan, self.block
         return _Input(
             b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, plan.relative,
             plan.child_pointers, plan.children, plan.update_offsets, plan.edge_pointers, plan.edge_index,
@@ -157,12 +153,12 @@ class CholeskyFactor:
         with one_blas_thread():
             failed, pivot = _factor_all(self, given)
         self.smallest_pivot = float(pivot[0])
-        self.weakest_node = int(self.symbolic.permutation[int(pivot[1]) // self.block])
+        self.weakest_node = int(self.plan.permutation[int(pivot[1]) // self.block])
         return not failed and bool(pivot[0] > PIVOT_TOLERANCE * np.finfo(self.dtype).eps)
 
     def log_determinant(self) -> float:
         """Return the logarithm of the determinant of the factored matrix, its grounding included."""
-        plan, b, total = self.symbolic, self.block, 0.0
+        plan, b, total = self.plan, self.block, 0.0
         widths = np.diff(plan.first) * b
         heights = np.diff(plan.row_pointers) * b
         for s, (width, below) in enumerate(zip(widths.tolist(), heights.tolist(), strict=True)):
@@ -170,13 +166,17 @@ class CholeskyFactor:
             total += float(np.log(panel[:: width + below + 1][:width]).sum())
         return 2.0 * total
 
+    def selected_inverse(self, edges: IntArray) -> SelectedInverse:
+        """Return the blocks of the inverse at nodes and edges; see `laplacian.selected`."""
+        return selected_inverse(self.plan, self.block, self.panels, edges)
+
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with L x = rhs, with x = 0 at the grounded node, in float64.
 
         `rhs` is (n,) or (n, k) for block 1, else (n, b) or (n, b, k). Each right-hand side must be orthogonal
         to the constants (of each of the b components).
         """
-        plan, b = self.symbolic, self.block
+        plan, b = self.plan, self.block
         n = plan.num_nodes
         lead = (n,) if b == 1 else (n, b)
         if np.shape(rhs)[: len(lead)] != lead or np.ndim(rhs) > len(lead) + 1:
@@ -192,57 +192,9 @@ class CholeskyFactor:
         return out.reshape(np.shape(rhs))
 
 
-def analyze(num_nodes: int, edges: npt.ArrayLike, ordering: Ordering | IntArray = "auto") -> SymbolicFactor:
-    """Plan the factorization of the Laplacians of a graph, whatever their weights, block size and precision.
-
-    `num_nonzeros`, `flops` and `num_bytes` of the plan say what a factorization would cost; still earlier,
-    and cheaper, the elimination tree of `best_order` does.
-
-    Args:
-        num_nodes: n >= 1.
-        edges: (m, 2) node indices; repeated edges add up. InputError for an index out of range or a
-            self-loop.
-        ordering: a method of `ordering.best_order`, or an order of elimination (n,) itself.
-    """
-    pairs = check_edges(num_nodes, edges)
-    graph = adjacency(num_nodes, pairs)
-    tree = best_order(graph, ordering) if isinstance(ordering, str) else elimination_tree(graph, ordering)
-    return plan_factorization(graph, pairs, tree)
-
-
-def allocate_factor(
-    symbolic: SymbolicFactor, block: int = 1, dtype: npt.DTypeLike = np.float64, *, threads: int = 1
-) -> CholeskyFactor:
-    """Allocate the memory of a factor, `symbolic.num_bytes(block, dtype, threads)` while it is computed.
-
-    Its numbers and answers do not depend on `threads`.
-    """
-    area = block * block
-    return CholeskyFactor(
-        symbolic=symbolic,
-        block=block,
-        panels=np.empty(int(symbolic.panel_pointers[-1]) * area, dtype=dtype),
-        workers=Workers(threads),
-        _diagonal=np.empty((symbolic.num_nodes, area)),
-    )
-
-
-def factorize(
-    symbolic: SymbolicFactor,
-    weights: FloatArray,
-    dtype: npt.DTypeLike = np.float64,
-    ground: float | None = None,
-) -> CholeskyFactor:
-    """Allocate a factor and compute it; see `CholeskyFactor.refactor`."""
-    block = 1 if np.ndim(weights) == 1 else np.shape(weights)[1]
-    factor = allocate_factor(symbolic, block, dtype)
-    factor.refactor(weights, ground)
-    return factor
-
-
 def _factor_all(factor: CholeskyFactor, given: _Input) -> tuple[bool, FloatArray]:
     """Factor all supernodes; return whether a pivot was not positive, and the least pivot and its row."""
-    plan = factor.symbolic
+    plan = factor.plan
     arenas = min(factor.workers.threads, len(plan.tasks))
     size = (plan.stack_size + arenas * plan.arena_size) * factor.block**2
     stack = np.empty(size, dtype=factor.dtype)  # update matrices that wait for their parents, then the arenas
@@ -289,7 +241,7 @@ def _factor_above(
     factor: CholeskyFactor, given: _Input, stack: npt.NDArray[Any], begin: int, end: int, pivot: Any
 ) -> bool:
     """Factor a run of supernodes above the tasks: the large ones by strips, the others as in a task."""
-    plan = factor.symbolic
+    plan = factor.plan
 
     def run(first: int, last: int, from_step: int, to_step: int) -> bool:
         blas = blas_of(factor.dtype)
@@ -312,7 +264,7 @@ def _factor_above(
 
 def _factor_large(factor: CholeskyFactor, stack: npt.NDArray[Any], s: int, pivot: Any) -> bool:
     """Factor one assembled front by strips of columns, and write its update, in parallel jobs."""
-    plan, b, workers, dtype = factor.symbolic, factor.block, factor.workers, factor.dtype
+    plan, b, workers, dtype = factor.plan, factor.block, factor.workers, factor.dtype
     width = int(plan.first[s + 1] - plan.first[s]) * b
     height = width + int(plan.row_pointers[s + 1] - plan.row_pointers[s]) * b
     below, size = height - width, factor.panels.itemsize
@@ -507,7 +459,7 @@ def _add_children(
 
 def _substitute(factor: CholeskyFactor, x: npt.NDArray[Any]) -> None:
     """Solve L L^T y = x in place for three right-hand sides: the tasks, what is above them, and back."""
-    plan, b = factor.symbolic, factor.block
+    plan, b = factor.plan, factor.block
     outer = np.zeros((len(plan.tasks), *x.shape), dtype=x.dtype)  # what each task leaves for rows above it
 
     def descend(run: IntArray, outer: npt.NDArray[Any]) -> Callable[[], object]:

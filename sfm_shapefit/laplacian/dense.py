@@ -15,6 +15,9 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import IntArray, frozen
 from sfm_shapefit.base.jit import array_address, call_address, function_address, inner_kernel, kernel
 
+PIVOT_TOLERANCE = 64.0
+"""Rounding units of the diagonal entry; smaller pivots count as zero."""
+
 Block = tuple[int, int]
 """The address of the first entry of a matrix, and its leading dimension."""
 

@@ -17,12 +17,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.jit import array_address, inner_kernel, kernel
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.laplacian.dense import blas_of, gemm, trsm
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
 _STRIP = 64  # rows of a product; half of it is wanted, and smaller products are slower
 _Solve = Callable[[FloatArray], FloatArray]
@@ -46,14 +47,19 @@ def regauged(nodes: FloatArray, solve: _Solve, null: FloatArray, dual: FloatArra
     return np.asarray(nodes - cross - cross.transpose(0, 2, 1) + null @ middle @ null.transpose(0, 2, 1))
 
 
-def selected_inverse(factor: CholeskyFactor, edges: IntArray) -> SelectedInverse:
+def selected_inverse(
+    plan: SymbolicFactor, b: int, panels: npt.NDArray[Any], edges: IntArray
+) -> SelectedInverse:
     """Return the blocks of the inverse at the nodes and edges of the graph.
 
-    The float64 factor's `refactor` succeeded; `edges` (m, 2) are those it was planned for, and say how each
-    block is to be turned. ValueError if it is not float64, or the edges are not as many.
+    Args:
+        plan, b, panels: a factor whose blocks are b x b.
+        edges: (m, 2) those that it was planned for, which say how each block is to be turned.
+
+    Raises:
+        ValueError: if it is not float64, or the edges are not as many.
     """
-    plan, b = factor.symbolic, factor.block
-    if factor.dtype != np.float64 or len(edges) != plan.num_edges:
+    if panels.dtype != np.float64 or len(edges) != plan.num_edges:
         raise ValueError("selected_inverse takes a float64 factor and the edges it was planned for")
     nodes, blocks = np.empty((plan.num_nodes, b, b)), np.empty((plan.num_edges, b, b))
     places = plan.update_offsets.copy()
@@ -73,7 +79,7 @@ def selected_inverse(factor: CholeskyFactor, edges: IntArray) -> SelectedInverse
         plan.permutation,
     )  # fmt: skip
     with one_blas_thread():
-        _invert(plan_arrays, factor.panels, memory, blas_of(factor.dtype), nodes, blocks)
+        _invert(plan_arrays, panels, memory, blas_of(panels.dtype), nodes, blocks)
     reversed_edges = plan.inverse[edges[:, 0]] < plan.inverse[edges[:, 1]]  # stored: (later, earlier)
     blocks[reversed_edges] = blocks[reversed_edges].transpose(0, 2, 1)
     return SelectedInverse(nodes=nodes, edges=blocks)

@@ -27,9 +27,6 @@ from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.laplacian.operators import Adjacency, group_by
 
-DEFAULT_FACTOR_BYTES = 2_000_000_000
-"""Bytes of one factor, unless the caller says otherwise; that of a dense matrix of 16,000 unknowns."""
-
 _MERGE_ALWAYS = 0.03  # share of zeros in the merged panel; up to it a child joins its parent in any case
 _MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))  # columns and share of zeros; small panels may have more
 _LARGEST_TASK = 1 / 6  # share of all entries; subtrees with more are divided, so that threads end together
@@ -129,9 +126,14 @@ class SymbolicFactor:
         """Number of supernodes, S."""
         return len(self.parent)
 
+    @property
+    def num_entries(self) -> int:
+        """Entries of the scalar factor that are stored, explicit zeros included."""
+        return int(self.panel_pointers[-1])
+
     def num_bytes(self, block: int = 1, dtype: npt.DTypeLike = np.float64, threads: int = 1) -> int:
         """Return the memory of the numeric factor: its panels, and the stack while it is computed."""
-        entries = int(self.panel_pointers[-1]) + self.stack_size + threads * self.arena_size
+        entries = self.num_entries + self.stack_size + threads * self.arena_size
         return entries * block * block * np.dtype(dtype).itemsize
 
 

@@ -23,7 +23,7 @@ from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.verdicts import Hold, find_hold
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
+from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.measure import Measured, add_evidence, build_graph
 from sfm_shapefit.placement.gauge import coincide

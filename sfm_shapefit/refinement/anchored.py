@@ -16,7 +16,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.losses import ARCTANGENT, loss, weighed
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
+from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.refinement.angular import (
     DAMPING,
     KERNEL_WIDTH,

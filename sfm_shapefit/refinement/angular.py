@@ -37,18 +37,17 @@ from sfm_shapefit.base.losses import ARCTANGENT, GEMAN_MCCLURE, loss, weighed
 from sfm_shapefit.base.scipy_parts import chdtri
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.cholesky import allocate_factor
-from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor, plan_factorization
+from sfm_shapefit.laplacian.factor import (
+    DEFAULT_FACTOR_BYTES,
+    FactorPlan,
+    LaplacianFactor,
+    allocate_factor,
+    analyze,
+)
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
-from sfm_shapefit.solver.splitting.linear import (
-    LaplacianFactor,
-    Resources,
-    laplacian_factor,
-    predict_factor,
-)
+from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor, predict_factor
 
 KERNEL_WIDTH = 3.0
 """k, in standard deviations; a residual of k counts half of what it can."""
@@ -92,7 +91,7 @@ class AngularResult:
 
 def plan_refinement(
     graph: ViewGraph, max_bytes: int = DEFAULT_FACTOR_BYTES, threads: int = 1
-) -> SymbolicFactor | IterativeNormal | None:
+) -> FactorPlan | IterativeNormal | None:
     """Return what the refinement solves its steps with; None if its factor would take too much memory.
 
     Where a factor in blocks is much work the graph is well connected, and conjugate gradients need few steps.
@@ -100,14 +99,14 @@ def plan_refinement(
     prediction = predict_factor(graph)
     if prediction.tree is None or prediction.flops * graph.dimension**3 > _MAX_FLOPS:
         return IterativeNormal(graph, laplacian_factor(graph, Resources(threads, max_bytes), prediction))
-    plan = plan_factorization(adjacency(graph.num_nodes, graph.edges), graph.edges, prediction.tree)
+    plan = analyze(graph.num_nodes, graph.edges, prediction.tree)
     return plan if plan.num_bytes(graph.dimension, np.float64) <= max_bytes else None
 
 
 def refine_angles(
     measured: MeasuredGraph,
     start: FloatArray,
-    plan: SymbolicFactor | LaplacianFactor,
+    plan: FactorPlan | LaplacianFactor,
     other: FloatArray | None = None,
 ) -> AngularResult:
     """Refine locations by robust Levenberg-Marquardt in the angles of the directions.
@@ -129,7 +128,7 @@ def refine_angles(
     other = None if other is None else unit_norm(other)
     t, damping, steps = first, DAMPING.first, 0
     still = _STILL_PER_LEVEL if isinstance(plan, IterativeNormal) else 0.0
-    moves_singly = isinstance(plan, SymbolicFactor | IterativeNormal)
+    moves_singly = isinstance(plan, FactorPlan | IterativeNormal)
     levels = np.full(int(classes.max()) + 1, _FIRST_LEVEL_RAD)
     while steps < _MAX_STEPS:
         lower = np.clip(residual_levels(measured, t, levels), levels / 2.0, levels)
@@ -198,9 +197,9 @@ class AngularTerms:
         return baselines, graph.directions, graph.weights, self._information, floor, self._kind
 
 
-def allocate_normal(plan: SymbolicFactor | LaplacianFactor, dimension: int) -> LaplacianFactor:
+def allocate_normal(plan: FactorPlan | LaplacianFactor, dimension: int) -> LaplacianFactor:
     """Return memory for a factor of what `plan_refinement` says."""
-    return allocate_factor(plan, dimension) if isinstance(plan, SymbolicFactor) else plan
+    return allocate_factor(plan, dimension) if isinstance(plan, FactorPlan) else plan
 
 
 def take_angular_step(

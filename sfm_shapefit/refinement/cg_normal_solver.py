@@ -13,7 +13,8 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
-from sfm_shapefit.solver.splitting.linear import LaplacianFactor, preconditioner
+from sfm_shapefit.laplacian.factor import LaplacianFactor
+from sfm_shapefit.solver.splitting.linear import preconditioner
 
 _REDUCTION = 0.1  # share of the residual that a solve may leave; damped steps need no more
 _STALE = 0.2  # mean change of the scalar weights, over their mean; after a smaller one a factor still does
@@ -22,6 +23,8 @@ _MAX_STEPS = 80  # conjugate gradient steps, a bound; a solve that ends there is
 
 class IterativeNormal:
     """What `angular.refine_angles` takes in place of a factor's plan; memory is linear in the edges."""
+
+    plan = None
 
     def __init__(self, graph: ViewGraph, scalar: LaplacianFactor) -> None:
         """Take the graph, and a factor of its scalar Laplacians, which is overwritten."""

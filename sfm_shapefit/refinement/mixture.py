@@ -56,11 +56,10 @@ from sfm_shapefit.base.geometry import tangent_bases
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.scipy_parts import gammaln, logit
 from sfm_shapefit.graph.measured import MeasuredGraph
-from sfm_shapefit.laplacian.cholesky import allocate_factor
-from sfm_shapefit.laplacian.selected import selected_inverse
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+from sfm_shapefit.laplacian.factor import FactorPlan, allocate_factor
 from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.refinement.length_prior import LengthPrior
+from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
 
 _LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
@@ -80,7 +79,7 @@ _SETTLED = 1e-4  # change of a share; a smaller one is none
 _SHORTEST = 3e-3  # median lengths; the directions of shorter baselines turn with every step
 _LONGEST = 50.0  # median lengths, geometric mean of a node's pairs; e^4, twice the largest spread of lengths
 _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; above rounding
-_DAMPING = (1e-3, 1e-10, 1e2)  # shares of the median information: first, least, most; more moves nothing
+_DAMPING = DampingRange(1e-3, 1e-10, 1e2)  # shares of the median information; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
 _LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.003  # nats; a smaller change of the bound is none
 _SMALL_STEP = 1e-3  # nats that a step promises; below, it is taken unseen, since rounding may hide the gain
@@ -196,7 +195,7 @@ class _System(NamedTuple):
 class Mixture:
     """The mixture model of a connected graph of cameras that move one by one."""
 
-    def __init__(self, measured: MeasuredGraph, plan: SymbolicFactor) -> None:
+    def __init__(self, measured: MeasuredGraph, plan: FactorPlan) -> None:
         """Take a graph and the plan of its factor."""
         graph = self._graph = measured.graph
         d, bases = graph.dimension, tangent_bases(graph.directions)
@@ -254,7 +253,7 @@ class Mixture:
             levels = levels._replace(right=_right_share(self._expect(expected, levels, 0.0).sums))
             noise = _Noise(levels, 0.0, self._own, variances, *self._precisions(at.lengths))
             system = self._equations(at, noise.precision, self._expect(expected, levels, 0.0))
-            if not self._refactor(system, _DAMPING[1]):
+            if not self._refactor(system, _DAMPING.least):
                 return -np.inf
             bound, variances = self._log_determinant(system, noise) - system.cost, self._propagate(at)
         return bound
@@ -266,7 +265,7 @@ class Mixture:
 
         Errors have variances `opened`, (m, d - 1), beside their own, which fall as the floor does.
         """
-        at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING[0], -np.inf, None
+        at, damping, bound, last = self._residuals(self._draw_in(start)), _DAMPING.first, -np.inf, None
         variances, path = np.zeros_like(self._own), list[FloatArray]()
         for step in range(_MOST_STEPS):
             own = self._own + opened
@@ -322,14 +321,19 @@ class Mixture:
         With them the damping for the next step; the factor stays that of the step.
         """
         right = -adjoint(system.gradient, self._graph.edges, self._graph.num_nodes)
-        while damping <= _DAMPING[2]:
-            if self._refactor(system, damping):
-                step = self._factor.solve(right)
-                there = self._residuals(self._draw_in(at.locations + step))
-                if np.vdot(right, step) < _SMALL_STEP or self._cost(there, noise) < system.cost:
-                    return there, max(damping / 10.0, _DAMPING[1])
-            damping *= 10.0
-        return at if self._refactor(system, _DAMPING[1]) else None, _DAMPING[0]
+
+        def propose(damping: float) -> _Residuals | None:
+            if not self._refactor(system, damping):
+                return None
+            step = self._factor.solve(right)
+            there = self._residuals(self._draw_in(at.locations + step))
+            helps = np.vdot(right, step) < _SMALL_STEP or self._cost(there, noise) < system.cost
+            return there if helps else None
+
+        moved, damping = take_damped_step(propose, damping, _DAMPING)
+        if moved is None and self._refactor(system, _DAMPING.least):
+            moved = at
+        return moved, damping
 
     def _residuals(self, t: FloatArray) -> _Residuals:
         """Return the errors of the directions at locations, which are centered and scaled."""
@@ -452,7 +456,7 @@ class Mixture:
 
     def _propagate(self, at: _Residuals) -> FloatArray:
         """Return the variance of each residual by that of the locations, (m, d - 1), rad^2."""
-        inverse, variances = selected_inverse(self._factor, self._graph.edges), np.empty_like(self._own)
+        inverse, variances = self._factor.selected_inverse(self._graph.edges), np.empty_like(self._own)
         _project((inverse.nodes, inverse.edges), self._graph.edges, at.across, at.lengths, variances)
         return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
 

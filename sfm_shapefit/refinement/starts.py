@@ -19,7 +19,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+from sfm_shapefit.laplacian.factor import FactorPlan, LaplacianFactor
 from sfm_shapefit.refinement.angular import (
     ALIKE,
     AngularResult,
@@ -46,7 +46,7 @@ from sfm_shapefit.refinement.reweighted import (
 from sfm_shapefit.solver.options import PAIRS_AT_SCALE, SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.reduction import Reduction
-from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Resources
+from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 
 COLLAPSED = 0.3
@@ -165,7 +165,7 @@ class _Problem(NamedTuple):
     """What the starts of a graph are refined on."""
 
     measured: MeasuredGraph
-    normal_solver: SymbolicFactor | LaplacianFactor | None
+    normal_solver: FactorPlan | LaplacianFactor | None
     """What the refinement solves its steps with; None where the starts are not refined."""
     first: FloatArray
     """(n, d) ShapeFit's optimum."""
@@ -284,7 +284,7 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
     is_bare = measured.evidence is None and measured.num_points == 0
     if not (options.objective == "auto" and is_bare and can_be_reweighted(measured)):
         return None
-    if not isinstance(plan, SymbolicFactor):
+    if not isinstance(plan, FactorPlan):
         return None
     model = Mixture(measured, plan)
     candidates = _descend_from_starts(model, problem, options)
@@ -423,7 +423,7 @@ def _explain(usual: ResidualMixture, reweighted: Reweighted) -> str:
 
 def _plan_normal_solver(
     measured: MeasuredGraph, options: PlacementOptions
-) -> SymbolicFactor | LaplacianFactor | None:
+) -> FactorPlan | LaplacianFactor | None:
     """Return what the refinement solves its steps with; None if its factor would be too large."""
     graph, groups, max_bytes = measured.graph, measured.groups, options.solver.factor_bytes
     if groups is None:

@@ -22,10 +22,9 @@ from sfm_shapefit.laplacian.approximate import (
     conjugate_gradients,
     diagonal_suffices,
 )
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
+from sfm_shapefit.laplacian.factor import Factor, FactorPlan, allocate_factor, analyze
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order, widest_level
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.rotations.averaging_kernels import apply_blocks
 
 RIDGE = 1e-9
@@ -50,7 +49,7 @@ class AveragingSystem:
     num_nodes: int
     pairs: IntArray
     """(k, 2)"""
-    plan: SymbolicFactor | None
+    plan: FactorPlan | None
     """Plan of the factors; None where no factor is small enough."""
     factors_blocks: bool
     """Whether the factor of blocks is small enough too."""
@@ -59,7 +58,7 @@ class AveragingSystem:
     threads: int
     graph: Adjacency
     """The pairs of each camera."""
-    _factors: dict[int, CholeskyFactor] = field(default_factory=dict)
+    _factors: dict[int, Factor] = field(default_factory=dict)
     """By the size of their blocks."""
     _operator: LaplacianOperator | None = None
     _preconditioner: Preconditioner | None = None
@@ -102,7 +101,7 @@ class AveragingSystem:
         sums = sum(sum_by(ends, rows, self.num_nodes) for ends in self.pairs.T)
         return np.asarray(sums).reshape(-1, *blocks.shape[1:])
 
-    def ground_blocks(self, blocks: FloatArray) -> CholeskyFactor:
+    def ground_blocks(self, blocks: FloatArray) -> Factor:
         """Return the factor of the Laplacian of blocks without ridge, grounded at its last node."""
         factor = self._factor_of(3)
         factor.refactor(blocks)
@@ -112,7 +111,7 @@ class AveragingSystem:
         """Return whether blocks (n, 3, 3), and (k, 3, 3) at (i, j) of pairs, make a definite matrix."""
         return self._factor_of(3).refactor_blocks(self.pairs, diagonal, blocks)
 
-    def _factor_of(self, block: int) -> CholeskyFactor:
+    def _factor_of(self, block: int) -> Factor:
         """Return the memory of the factor with blocks of that size."""
         assert self.plan is not None
         if block not in self._factors:
@@ -183,7 +182,7 @@ def plan_system(num_nodes: int, pairs: IntArray, weights: FloatArray, threads: i
     if not hopeless:
         tree = best_order(graph)
         if tree.flops <= most:
-            plan = plan_factorization(graph, pairs, tree)
+            plan = analyze(num_nodes, pairs, tree)
     factors_blocks = plan is not None and _BLOCK_FLOPS * plan.flops <= most
     return AveragingSystem(num_nodes, pairs, plan, factors_blocks, jacobi, threads, graph)
 

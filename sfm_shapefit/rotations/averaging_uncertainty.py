@@ -30,7 +30,6 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, sum_by
 from sfm_shapefit.base.forests import connected_components
-from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.rotations.annealing import AveragingPairs, Linearized
 from sfm_shapefit.rotations.averaging_system import RIDGE, AveragingSystem, plan_system
 
@@ -103,7 +102,7 @@ def _factored(
 ) -> tuple[FloatArray, FloatArray]:
     """Return a third of the trace of P L^+ P at each camera, (n,), and the leverage of each pair, (k,)."""
     factor = system.ground_blocks(last.blocks)
-    inverse = selected_inverse(factor, system.pairs)
+    inverse = factor.selected_inverse(system.pairs)
     i, j = system.pairs.T
     difference = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
     leverages = np.einsum("kab,kab->k", last.blocks, difference) / 3.0

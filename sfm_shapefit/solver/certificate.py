@@ -53,10 +53,9 @@ from sfm_shapefit.base.jit import array_address, kernel
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
-from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.dense import blas_of, potrf
-from sfm_shapefit.laplacian.operators import Workers, adjacency
-from sfm_shapefit.laplacian.symbolic import plan_factorization
+from sfm_shapefit.laplacian.factor import allocate_factor, analyze
+from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
 from sfm_shapefit.solver.reduction import Reduction
@@ -538,7 +537,7 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray, reduction: Reduct
     if is_dense:
         return _is_regular_dense(graph, blocks)
     if reduction is None:
-        plan = plan_factorization(adjacency(n, graph.edges), graph.edges, graph.elimination_tree())
+        plan = analyze(n, graph.edges, graph.elimination_tree())
         reduction = Reduction(allocate_factor(plan, d))
     try:
         reduction.refactor(blocks)

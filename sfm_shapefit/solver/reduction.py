@@ -32,7 +32,7 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import FloatArray, IntArray, sum_by
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.groups import RigidGroups
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor, analyze
+from sfm_shapefit.laplacian.factor import Factor, allocate_factor, analyze
 
 _LEAST_SCHUR = 1e-13  # share of eta; less of s, when all groups may move, is rounding
 
@@ -44,8 +44,10 @@ class Reduction:
     one for each unit, see `RigidGroups`.
     """
 
+    plan = None
+
     def __init__(
-        self, factor: CholeskyFactor, groups: RigidGroups | None = None, edges: IntArray | None = None
+        self, factor: Factor, groups: RigidGroups | None = None, edges: IntArray | None = None
     ) -> None:
         """Keep the sparse factor over nodes or groups, which says what a factorization and a solve cost.
 
@@ -137,7 +139,7 @@ class Reduction:
 
     def _at_groups(self, values: FloatArray) -> FloatArray:
         """Return the sum of the signed values (m, d) at each group, (B, d)."""
-        leaving, entering = (sum_by(end, values, self.factor.symbolic.num_nodes) for end in self._ends.T)
+        leaving, entering = (sum_by(end, values, self.factor.plan.num_nodes) for end in self._ends.T)
         return np.asarray(leaving - entering)
 
 

@@ -16,9 +16,7 @@ from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.cholesky import analyze
-from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
+from sfm_shapefit.laplacian.factor import FactorPlan, analyze
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton.dense import solve_newton_dense
@@ -265,7 +263,7 @@ def _refuse_open_groups(between: ViewGraph, unit: RigidGroups) -> None:
         raise UnsolvableError("the directions cancel at every group, so no scale can be fixed")
 
 
-def plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
+def plan_factor(measured: MeasuredGraph) -> FactorPlan | None:
     """Return the plan of the largest factor of a placement; None where no order keeps one sparse."""
     edges = np.ascontiguousarray(measured.graph.edges)
     if measured.groups is not None:
@@ -273,5 +271,4 @@ def plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
         return analyze(measured.groups.num_groups, np.ascontiguousarray(ends))
     if predict_factor(measured.graph).tree is None:
         return None
-    neighbors = adjacency(measured.graph.num_nodes, edges)
-    return plan_factorization(neighbors, edges, measured.graph.elimination_tree())
+    return analyze(measured.graph.num_nodes, edges, measured.graph.elimination_tree())

@@ -98,6 +98,11 @@ def ring_problem(
         lens_of_camera=np.arange(count) % len(lenses),
         rig=rig,
     )
+    return project(problem, rng, noise_px)
+
+
+def project(problem, rng, noise_px):
+    """Return the problem, whose pixels are 0, with those of its points and noise."""
     exact = reprojection_residuals(problem, values_of(problem))
     assert np.isfinite(exact).all()
     return replace(problem, pixels=exact + noise_px * rng.standard_normal(exact.shape))

@@ -23,7 +23,7 @@ from sfm_shapefit.adjustment.solve import Ending, adjust, frames_not_gained, rep
 from sfm_shapefit.adjustment.solve import linearize_all as every
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity
-from sfm_shapefit.laplacian.cholesky import allocate_factor
+from sfm_shapefit.laplacian.factor import allocate_factor
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.lens import Lens
@@ -91,7 +91,7 @@ def test_fixed_frames_stay_to_the_bit(fixed, hold):
     assert moved.sum() == truth.num_frames - len(fixed)
 
 
-@pytest.mark.parametrize("solver", ["dense", "sparse"])
+@pytest.mark.parametrize("solver", ["dense", "sparse", "iterative"])
 def test_everything_fixed_leaves_points_to_adjust(solver):
     truth, start = make_start(fixed=range(12))
     found = adjust(start, replace(TIGHT, linear_solver=solver))
@@ -233,7 +233,7 @@ def test_a_factor_of_32_bits_that_leads_nowhere_gets_64(monkeypatch):
     np.testing.assert_allclose(*centers, atol=1e-9 * np.ptp(centers[0]))
 
 
-@pytest.mark.parametrize("solver", ["dense", "sparse"])
+@pytest.mark.parametrize("solver", ["dense", "sparse", "iterative"])
 def test_entries_given_up_while_a_system_is_factored_change_nothing(monkeypatch, solver):
     _, start = make_start()
     kept = adjust(start, TIGHT, linear_solver=solver)
@@ -246,7 +246,7 @@ def test_entries_given_up_while_a_system_is_factored_change_nothing(monkeypatch,
     np.testing.assert_array_equal(given_up.problem.points, kept.problem.points)
 
 
-@pytest.mark.parametrize("solver", ["dense", "sparse"])
+@pytest.mark.parametrize("solver", ["dense", "sparse", "iterative"])
 def test_threads_do_not_change_one_bit(solver):
     """Enough cameras for strips of a dense factor, and observations for several chunks of points."""
     _, start = make_start(num_cameras=48, num_points=400, models=("OPENCV", "PINHOLE"))
@@ -285,7 +285,7 @@ def test_a_camera_without_observations_and_a_point_behind_all_are_held():
         lens_of_camera=np.zeros(n + 1, np.int64),
         fixed=np.arange(n + 1) < 2,  # a gauge, so that nothing moves with everything
     )
-    for solver in ("dense", "sparse"):
+    for solver in ("dense", "sparse", "iterative"):
         found = adjust(extra, replace(TIGHT, linear_solver=solver))
         assert found.converged
         np.testing.assert_array_equal(found.problem.centers[n], extra.centers[n])

@@ -41,7 +41,7 @@ def expected_covariances(problem, options, num_free):
     return layout, inverse, rows
 
 
-@pytest.mark.parametrize("solver", ["dense", "sparse"])
+@pytest.mark.parametrize("solver", ["dense", "sparse", "iterative"])
 @pytest.mark.parametrize("case", ["free", "held", "weighted", "fixed", "lenses", "anchored"])
 def test_covariances_are_blocks_of_the_inverse_of_the_whole_matrix(case, solver):
     models = ("OPENCV", "SIMPLE_RADIAL")

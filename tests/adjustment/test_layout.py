@@ -55,7 +55,7 @@ def test_lenses_that_look_at_other_points_share_no_node():
     assert all(len({k % 2 for k in own}) == 1 for own in lenses_by_node(problem))
 
 
-@pytest.mark.parametrize("solver", ["dense", "sparse"])
+@pytest.mark.parametrize("solver", ["dense", "sparse", "iterative"])
 def test_the_answer_does_not_depend_on_which_lenses_share_a_node(monkeypatch, solver):
     problem = with_a_lens_each(["SIMPLE_RADIAL"] * 8, noise_px=0.3)
     options = replace(OPTIONS, linear_solver=solver)

@@ -17,7 +17,7 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.laplacian import ordering, symbolic
 from sfm_shapefit.laplacian.approximate import JacobiPreconditioner, approximate_cholesky, conjugate_gradients
-from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze, factorize
+from sfm_shapefit.laplacian.factor import allocate_factor, analyze, factorize
 from sfm_shapefit.laplacian.operators import LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree
 from sfm_shapefit.solver.program import differences
@@ -470,7 +470,7 @@ CHILD = """
 import hashlib
 import numpy as np
 from tests.graph_families import geo, random_weights
-from sfm_shapefit.laplacian.cholesky import analyze, factorize
+from sfm_shapefit.laplacian.factor import analyze, factorize
 edges, t = geo(2000, 20.0, 1)
 plan = analyze(2000, edges, "minimum-degree")
 for dtype in (np.float32, np.float64):

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from harness.graphs import laplacian_matrix
-from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze, factorize
-from sfm_shapefit.laplacian.selected import selected_inverse
+from sfm_shapefit.laplacian.factor import allocate_factor, analyze, factorize
 from sfm_shapefit.synthetic import box_graph_problem, trajectory_graph_problem
 from tests.graph_families import random_blocks
 
@@ -18,10 +17,10 @@ def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
     edges = np.where(rng.random(len(edges))[:, None] < 0.5, edges, edges[:, ::-1])  # either way round
     weights = random_blocks(len(edges), b, seed=b)
     factor = factorize(analyze(n, edges), weights, ground=7.0)
-    found = selected_inverse(factor, edges)
+    found = factor.selected_inverse(edges)
 
     matrix = laplacian_matrix(n, edges, weights).toarray().reshape(n, b, n, b)
-    last = factor.symbolic.permutation[-1]
+    last = factor.plan.permutation[-1]
     matrix[last, :, last, :] += 7.0 * np.eye(b)
     whole = np.linalg.inv(matrix.reshape(n * b, n * b)).reshape(n, b, n, b)
     nodes = np.arange(n)
@@ -33,10 +32,10 @@ def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
 def test_entries_are_right_where_the_factor_is_cut_into_tasks_and_single_precision_is_refused():
     edges = trajectory_graph_problem(6000, 60.0, seed=0).edges
     with pytest.raises(ValueError, match="float64"):
-        selected_inverse(factorize(analyze(6000, edges), np.ones(len(edges)), np.float32), edges)
+        factorize(analyze(6000, edges), np.ones(len(edges)), np.float32).selected_inverse(edges)
     factor = factorize(analyze(6000, edges), np.ones(len(edges)), ground=7.0)
-    assert len(factor.symbolic.tasks) > 1
-    found = selected_inverse(factor, edges)
+    assert len(factor.plan.tasks) > 1
+    found = factor.selected_inverse(edges)
     for node in range(0, 6000, 600):
         right = np.zeros((6000, 1))
         right[node] = 1.0
@@ -55,6 +54,6 @@ def test_entries_are_the_same_to_the_bit_for_any_number_of_threads(threads):
     for count in (1, threads):
         factor = allocate_factor(plan, 2, threads=count)
         factor.refactor(weights)
-        answers.append(selected_inverse(factor, edges))
+        answers.append(factor.selected_inverse(edges))
     np.testing.assert_array_equal(answers[0].nodes, answers[1].nodes)
     np.testing.assert_array_equal(answers[0].edges, answers[1].edges)

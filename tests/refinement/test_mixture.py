@@ -9,7 +9,7 @@ from sfm_shapefit.base.geometry import fit_similarity_l1, normalized
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.cholesky import analyze, factorize
+from sfm_shapefit.laplacian.factor import analyze, factorize
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement import mixture
 from sfm_shapefit.refinement.length_prior import LengthPrior

@@ -366,7 +366,7 @@ def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_giv
 @pytest.mark.parametrize("cheap", [True, False])
 def test_newton_begins_at_the_split_point_and_then_anew_where_that_is_cheap(cheap, monkeypatch):
     graph = draw_family("seq", 300, 36, q=0.1)
-    flops = 27.0 * laplacian_factor(graph).symbolic.flops
+    flops = 27.0 * laplacian_factor(graph).plan.flops
     monkeypatch.setattr(hybrid, "_CHEAP_FLOPS", flops if cheap else 0.99 * flops)
     monkeypatch.setattr(hybrid, "_NEWTON_STEPS", 1)  # too few from either point
     result = solve_hybrid(graph, 1e-8, 2000)

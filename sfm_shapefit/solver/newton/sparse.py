@@ -15,9 +15,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.cholesky import allocate_factor
-from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
+from sfm_shapefit.laplacian.factor import FactorPlan, allocate_factor, analyze
 from sfm_shapefit.solver.newton import steps
 from sfm_shapefit.solver.newton.steps import Iterate, Linearization, NewtonProgress, Problem, Work
 from sfm_shapefit.solver.options import OnIteration
@@ -34,7 +32,7 @@ def solve_newton_sparse(
     on_iteration: OnIteration | None = None,
     *,
     start: tuple[FloatArray, FloatArray] | None = None,
-    plan: SymbolicFactor | None = None,
+    plan: FactorPlan | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with a sparse Cholesky factor in d x d blocks.
 
@@ -51,8 +49,7 @@ def solve_newton_sparse(
         plan: of the factorization of the graph's Laplacian, if there already.
     """
     if plan is None:
-        neighbors = adjacency(graph.num_nodes, graph.edges)
-        plan = plan_factorization(neighbors, graph.edges, graph.elimination_tree())
+        plan = analyze(graph.num_nodes, graph.edges, graph.elimination_tree())
     reduction = Reduction(allocate_factor(plan, steps.working_dimension(graph)))
     return solve_newton_reduced(graph, reduction, tol, max_iterations, on_iteration, start)
 
@@ -108,8 +105,8 @@ def _cycle(work: Work, reduction: Reduction, progress: NewtonProgress, tol: floa
     if system is None:
         return NewtonProgress(*steps.close_cycle(iterate, progress, mu, first))
     factor, edge_work = reduction.factor, steps.EDGE_WORK * len(problem.w)
-    step_work = edge_work + steps.SOLVE_WORK * factor.panels.size
-    done = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
+    step_work = edge_work + steps.SOLVE_WORK * factor.plan.num_entries * factor.block**2
+    done = factor.plan.flops * factor.block**3 + 0.5 * edge_work
     for _ in range(steps.STEPS_PER_FACTOR):
         previous = progress.gap
         mu = steps.smoothing(progress, mu)

@@ -27,10 +27,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.laplacian.factor import LaplacianFactor
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, asks_to_stop
 from sfm_shapefit.solver.splitting.anderson import Anderson
 from sfm_shapefit.solver.splitting.edges import CHANGE, INTERIOR, OBJECTIVE, EdgePasses
-from sfm_shapefit.solver.splitting.linear import LaplacianFactor
 
 # Renewed penalties are rho_e = _PENALTY w_e / max(r_e, floor mean(r)).
 _PENALTY = 0.5  # dimensionless; see above

@@ -6,7 +6,7 @@ and halves the time and memory of many cameras; conjugate gradients that reduce 
 as solved.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,10 +20,10 @@ from sfm_shapefit.laplacian.approximate import (
     conjugate_gradients,
     diagonal_suffices,
 )
-from sfm_shapefit.laplacian.cholesky import allocate_factor
+from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES, LaplacianFactor, allocate_factor, analyze
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.ordering import widest_level
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, EliminationTree, plan_factorization
+from sfm_shapefit.laplacian.symbolic import EliminationTree
 
 # A solve by approximate Cholesky costs about 9 us per edge in all (5 set-ups, 40 x 3 steps), five float32
 # factorizations at 80 Gflop/s as much from 150,000 operations per edge on. Geometric and community graphs of
@@ -40,19 +40,6 @@ _LARGE = 5_000  # cameras of an expander; its factor takes longer than it saves
 # the kernels for float32, 2 s of compiling, are no part of a first run.
 _FEW = 500
 _SEED = 1  # seed of the approximate factor; same input, same answer
-
-
-class LaplacianFactor(Protocol):
-    """Solves with the Laplacian L = D^T diag(weights) D of one graph, whose weights change now and then.
-
-    `sfm_shapefit.laplacian.cholesky.CholeskyFactor` is one.
-    """
-
-    def refactor(self, weights: FloatArray) -> None:
-        """Take new edge weights, (m,) in the order of the graph's edges."""
-
-    def solve(self, rhs: FloatArray) -> FloatArray:
-        """Return x with L x = rhs, (n, d), up to a constant per column; the columns of rhs sum to 0."""
 
 
 class Resources(NamedTuple):
@@ -74,6 +61,8 @@ class IterativeSolver:
 
     The preconditioner is the diagonal on expanders (random graphs), else an approximate Cholesky factor.
     """
+
+    plan = None
 
     def __init__(self, graph: Adjacency, threads: int = 1) -> None:
         """Keep the graph; `refactor` must come before `solve`. The answers do not depend on `threads`."""
@@ -138,14 +127,13 @@ def laplacian_factor(
     if resources.factor is not None:
         return resources.factor
     tree = (predict_factor(graph) if prediction is None else prediction).tree
-    edges = np.ascontiguousarray(graph.edges)
-    neighbors = adjacency(graph.num_nodes, edges)
+    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     if tree is None or tree.flops > _FLOPS_PER_EDGE * graph.num_edges:
         return IterativeSolver(neighbors, resources.threads)
     dtype = np.float64 if graph.num_nodes < _FEW else np.float32
     if tree.num_nonzeros * np.dtype(dtype).itemsize > resources.memory_bytes:
         return IterativeSolver(neighbors, resources.threads)
-    plan = plan_factorization(neighbors, edges, tree)
+    plan = analyze(graph.num_nodes, graph.edges, tree)
     if plan.num_bytes(1, dtype) > resources.memory_bytes:
         return IterativeSolver(neighbors, resources.threads)
     return allocate_factor(plan, 1, dtype, threads=resources.threads)

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor
+from sfm_shapefit.laplacian.factor import LaplacianFactor
 from sfm_shapefit.solver.certificate import Certificate, certify_in_place
 from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.newton.steps import working_dimension
@@ -24,7 +24,6 @@ from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
 from sfm_shapefit.solver.splitting.engine import Goal, Iteration, Outcome, Stop, Tuning
 from sfm_shapefit.solver.splitting.linear import (
     ONE_THREAD,
-    LaplacianFactor,
     Prediction,
     Resources,
     laplacian_factor,
@@ -186,7 +185,7 @@ def _newton(
 ) -> HybridResult:
     """Go on from the best certified point by Newton steps, if their factor fits."""
     d, factor = working_dimension(graph), resources.factor
-    plan = factor.symbolic if isinstance(factor, CholeskyFactor) else None
+    plan = None if factor is None else factor.plan
     fits = plan is not None and plan.num_bytes(d, np.float64) <= resources.memory_bytes
     if factor is None or plan is None or not fits or plan.flops * d**3 > _NEWTON_FLOPS:
         return replace(result, stop=HybridStop.TOO_LARGE)
@@ -206,7 +205,7 @@ def _newton(
 
 def _is_cheap(factor: LaplacianFactor, dimension: int) -> bool:
     """Return whether a factorization in blocks takes no time to speak of."""
-    return isinstance(factor, CholeskyFactor) and factor.symbolic.flops * dimension**3 <= _CHEAP_FLOPS
+    return factor.plan is not None and factor.plan.flops * dimension**3 <= _CHEAP_FLOPS
 
 
 def _better(
