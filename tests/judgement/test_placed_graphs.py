@@ -79,10 +79,10 @@ def test_another_end_is_a_rival_where_it_explains_more_than_half_as_many_pairs_a
     problem = random_graph_problem(20, 1.0, sigma=0.01, seed=4)
     refined, m = place(problem.view_graph).refined, len(problem.edges)
     kept, theirs = np.arange(m) >= alone, (np.arange(m) < alone) | (np.arange(m) >= alone + against)
-    elsewhere = np.random.default_rng(0).normal(size=refined.locations.shape)
-    for locations, found in ((elsewhere, is_rival), (3.0 * refined.locations + 1.0, False)):
-        end = SimpleNamespace(locations=locations, posterior=theirs.astype(float))
-        both = replace(refined, posterior=kept.astype(float), rivals=(Rival(end=end, behind=0.0),))
+    end = SimpleNamespace(posterior=theirs.astype(float))
+    for is_apart, found in ((True, is_rival), (False, False)):
+        other = Rival(end=end, is_apart=is_apart, behind=0.0)
+        both = replace(refined, posterior=kept.astype(float), rivals=(other,))
         rival = find_rival(both)
         assert (rival is not None) == found
         assert not found or (rival.num_pairs, rival.num_against) == (alone, against)
