@@ -31,7 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
