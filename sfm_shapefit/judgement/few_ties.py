@@ -16,8 +16,10 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.forests import connected_components
-from sfm_shapefit.judgement.limits import ALIKE_DEG, FEWEST_ALIKE
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.limits import ALIKE_DEG, FEWEST_ALIKE, RARE
 from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.placement.conditioning import FEW_PAIRS
 
 
 class FewTies(NamedTuple):
@@ -40,6 +42,24 @@ def barely_held(num_nodes: int, edges: IntArray, directions: FloatArray) -> Bool
         differs = np.einsum("ed,ed->e", outward, told) < alike
         ends, outward = ends[differs], outward[differs]
     return np.asarray(np.bincount(ends, minlength=num_nodes) == 0)
+
+
+def held_by_chance(graph: ViewGraph, agrees: BoolArray, level_rad: float) -> IntArray:
+    """Return the nodes at most two of whose many pairs with the others agree, as chance lets two, ascending.
+
+    The ray of a wrong pair meets another within three standard deviations where it lies in a band about half
+    a half circle of directions: with odds of about `level_rad`, and its power d - 2 in d dimensions.
+    """
+    pairs = graph.degrees().astype(np.float64)
+    is_likely = 0.5 * pairs * (pairs - 1.0) * level_rad ** (graph.dimension - 2) > RARE
+    by_chance = np.zeros(graph.num_nodes, dtype=np.bool_)
+    while True:
+        holding = graph.edges[agrees & ~by_chance[graph.edges].any(axis=1)]
+        held = np.bincount(holding.ravel(), minlength=graph.num_nodes)
+        more = is_likely & (held <= FEW_PAIRS) & ~by_chance
+        if not more.any():
+            return np.flatnonzero(by_chance)
+        by_chance |= more
 
 
 def find_few_ties(num_nodes: int, edges: IntArray) -> list[FewTies]:

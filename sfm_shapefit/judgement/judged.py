@@ -7,6 +7,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.geometry import extent_of
+from sfm_shapefit.judgement.few_ties import held_by_chance
 from sfm_shapefit.judgement.limits import KNOWN_DEG
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.placement.place import Placement
@@ -78,11 +79,18 @@ def judge(placement: Placement, options: PlacementOptions) -> Judged:
     UnsolvableError if the factor for standard deviations would take more memory than allowed.
     """
     hand_back_memory()  # what the solve took, before the samples are propagated
-    part, agreement = placement.measured_part(), placement.agreement
+    part, agreement, undetermined = (
+        placement.measured_part(),
+        placement.agreement,
+        placement.refined.reset_nodes,
+    )
+    if placement.refined.variances is not None:
+        by_chance = held_by_chance(part.graph, agreement.agrees, agreement.level_rad)
+        undetermined = np.union1d(undetermined, by_chance)
     assessment = assess(
         part,
         placement.refined.locations,
-        undetermined_nodes=placement.refined.reset_nodes,
+        undetermined_nodes=undetermined,
         max_bytes=options.solver.factor_bytes,
         agreement=agreement,
     )

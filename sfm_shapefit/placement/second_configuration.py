@@ -31,11 +31,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, median_spread, normalized
+from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.placement.conditioning import LOOSE_SHARE
 from sfm_shapefit.refinement.posterior import TriangleEvidence, weigh_by_triangles
 from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.solver.program import differences
@@ -104,23 +103,16 @@ class SecondConfiguration:
 
 def find_rival(refined: RefinedPlacement) -> SecondConfiguration | None:
     """Return the best other end of the refinement that explains nearly as much, if any."""
-    kept, spread = refined.posterior > 0.5, median_spread(refined.locations)
+    kept = refined.posterior > 0.5
     for rival in refined.rivals:
         theirs = rival.end.posterior > 0.5
         alone, against = int(np.sum(theirs & ~kept)), int(np.sum(kept & ~theirs))
-        apart = _median_distance(rival.end.locations, refined.locations)
-        if apart > LOOSE_SHARE * spread and alone > max(_NEARLY_AS_MANY * against, _FEWEST_ALONE):
+        if rival.is_apart and alone > max(_NEARLY_AS_MANY * against, _FEWEST_ALONE):
             nodes = np.arange(len(refined.locations))
             return SecondConfiguration(
                 found=Found.BY_A_START, cameras=nodes, num_pairs=alone, num_against=against
             )
     return None
-
-
-def _median_distance(t: FloatArray, onto: FloatArray) -> float:
-    """Return the median distance of locations (n, d) from others, after the best shift and scale."""
-    fitted = fit_similarity_l1(t, onto, rotate=False).apply(t)
-    return float(np.median(np.linalg.norm(fitted - onto, axis=1)))
 
 
 def find_fold(

@@ -16,7 +16,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.factor import FactorPlan, LaplacianFactor
@@ -59,6 +59,7 @@ _LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 
 _POINT_WEIGHT = 10.0  # LUD's weight of a direction to a 3D point; one loss there serves every noise
 _TIE = 1e-3  # relative difference of costs; a smaller one says nothing where the starts disagree
 _POINT_LENGTH = 1e-6  # share of the mean length of all pairs; the cameras of a shorter one stand in one place
+_APART, _CAP = 0.05, 3.0  # spreads of a scene; median distance between two, and largest that counts as such
 _EXPLAINED = 0.9  # share of the pairs; an answer that explains fewer may be a fold, and triangles are asked
 _POORLY_EXPLAINED = 0.35  # share of the pairs; below, posteriors are followed from solve to solve, too
 OPENING_RAD = 0.1
@@ -90,6 +91,8 @@ class Rival:
 
     end: MixtureEnd
     """Its locations (n, d), in a scale and from an origin of their own, and which directions it explains."""
+    is_apart: bool
+    """Whether most of its locations are elsewhere; if so, it is the best end near where a start led to."""
     behind: float
     """Nats of evidence that the kept explanation has more, both at the noise of the noisier of the two."""
 
@@ -320,17 +323,37 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
 
 
 def _compare_ends(model: Mixture, candidates: list[_Candidate]) -> tuple[_Candidate, MixtureEnd, list[Rival]]:
-    """Return the candidate of most evidence, the end that it is improved to, and the others beside that."""
+    """Return the candidate of most evidence, the end that it is improved to, and the others beside that.
+
+    Another end that stands apart is improved, too: two places are compared at their best.
+    """
     best = candidates[0]
     for other in candidates[1:]:
         best = other if model.lead(other.end, best.end) > 0.0 else best
     # Starts may lead to one end; the certificate at posteriors is the one that says more of it.
     same = (found for found in candidates if found.end is best.end and found.reweighted is not None)
     best = next(same, best)
-    end = model.improve(best.end)
-    others = (found.end for found in candidates if found.end is not best.end)
-    rivals = sorted((Rival(end=x, behind=model.lead(end, x)) for x in others), key=lambda rival: rival.behind)
-    return best, end, rivals
+    end, others = model.improve(best.end), list[MixtureEnd]()
+    for other in [found for found in candidates if found.end is not best.end]:
+        theirs = other.end
+        if _is_apart(theirs.locations, end.locations):
+            theirs = model.improve(theirs)
+            if model.lead(theirs, end) > 0.0:
+                best, end, theirs = other, theirs, end
+        others.append(theirs)
+    rivals = (
+        Rival(end=x, is_apart=_is_apart(x.locations, end.locations), behind=model.lead(end, x))
+        for x in others
+    )
+    return best, end, sorted(rivals, key=lambda rival: rival.behind)
+
+
+def _is_apart(t: FloatArray, onto: FloatArray) -> bool:
+    """Return whether most locations (n, d) are not at others, after the best shift and scale."""
+    spread = median_spread(onto)
+    # The cap: a single location that is far out would shrink all others to one point.
+    fitted = fit_similarity_l1(t, onto, rotate=False, cap=_CAP * spread).apply(t)
+    return bool(np.median(np.linalg.norm(fitted - onto, axis=1)) > _APART * spread)
 
 
 def _descend_from_starts(model: Mixture, problem: _Problem, options: PlacementOptions) -> list[_Candidate]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit import ViewGraph, place
+from sfm_shapefit.base.geometry import fit_similarity_l1
 from sfm_shapefit.judgement.few_ties import barely_held, find_few_ties
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.placement.second_configuration import Found, find_fold, find_rival
@@ -57,6 +58,23 @@ def four_sides(share, seed, num_cameras=60):
     return graph_of(centers, pairs, seen, rng), quarters == 0
 
 
+def crossing_streets(share, seed):
+    """Return six streets of 13 cameras that cross; the noise of their pairs differs, a share is random."""
+    rng, along = np.random.default_rng(seed), np.arange(13.0)
+    streets = [np.column_stack([along, np.full(13, 6.0 * k), 0.0 * along]) for k in range(3)]
+    centers = np.concatenate([street[:, axes] for street in streets for axes in ([0, 1, 2], [1, 0, 2])])
+    centers += np.array([0.1, 0.1, 0.05]) * rng.normal(size=centers.shape)
+    pairs = np.column_stack(np.triu_indices(len(centers), 1))
+    is_one_street = pairs[:, 0] // 13 == pairs[:, 1] // 13
+    lengths = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
+    pairs = pairs[lengths < np.where(is_one_street, 4.5, 2.2)]
+    noise = 0.003 * np.exp(rng.normal(size=(len(pairs), 1))) * rng.normal(size=(len(pairs), 3))
+    directions = unit(unit(centers[pairs[:, 0]] - centers[pairs[:, 1]]) + noise)
+    is_wrong = rng.random(len(pairs)) < share
+    directions[is_wrong] = unit(rng.normal(size=(is_wrong.sum(), 3)))
+    return ViewGraph(len(centers), pairs, directions), centers
+
+
 def test_corridors_most_of_whose_pairs_are_a_segment_off_are_not_good_and_two_explanations_are_told():
     seen = [place(corridor(0.6, seed)[0]) for seed in range(5)]
     assert Grade.GOOD not in [placed.verdict.grade for placed in seen]
@@ -79,13 +97,39 @@ def test_another_end_is_a_rival_where_it_explains_more_than_half_as_many_pairs_a
     problem = random_graph_problem(20, 1.0, sigma=0.01, seed=4)
     refined, m = place(problem.view_graph).refined, len(problem.edges)
     kept, theirs = np.arange(m) >= alone, (np.arange(m) < alone) | (np.arange(m) >= alone + against)
-    elsewhere = np.random.default_rng(0).normal(size=refined.locations.shape)
-    for locations, found in ((elsewhere, is_rival), (3.0 * refined.locations + 1.0, False)):
-        end = SimpleNamespace(locations=locations, posterior=theirs.astype(float))
-        both = replace(refined, posterior=kept.astype(float), rivals=(Rival(end=end, behind=0.0),))
+    end = SimpleNamespace(posterior=theirs.astype(float))
+    for is_apart, found in ((True, is_rival), (False, False)):
+        other = Rival(end=end, is_apart=is_apart, behind=0.0)
+        both = replace(refined, posterior=kept.astype(float), rivals=(other,))
         rival = find_rival(both)
         assert (rival is not None) == found
         assert not found or (rival.num_pairs, rival.num_against) == (alone, against)
+
+
+@pytest.mark.parametrize(("seed", "is_bad"), [(5, True), (10, True), (13, True), (8, False), (36, False)])
+def test_where_streets_stand_is_doubted_where_another_start_ends_nearly_as_well(seed, is_bad):
+    graph, centers = crossing_streets(0.45, seed)
+    placed = place(graph)
+    fitted = fit_similarity_l1(placed.locations, centers[placed.cameras], rotate=False, cap=20.0)
+    apart = np.linalg.norm(fitted.apply(placed.locations) - centers[placed.cameras], axis=1)
+    assert (np.median(apart) > 0.03 * 17.0) == is_bad  # of the diagonal of the town
+    assert placed.verdict.is_bad == is_bad
+    assert (placed.second_configuration is not None) == is_bad
+
+
+@pytest.mark.parametrize(("noise", "is_known"), [(0.003, False), (0.0, True)])
+def test_where_two_of_many_rays_meet_a_camera_is_known_only_if_chance_could_not_do_that(noise, is_known):
+    """Camera 0 is seen by 21 others: two agree on one place, as of any 21 two do within the noise."""
+    rng = np.random.default_rng(3)
+    centers = rng.normal(size=(40, 3))
+    pairs = np.column_stack(np.triu_indices(40, 1))
+    pairs = pairs[(pairs[:, 0] > 0) | (pairs[:, 1] <= 21)]
+    directions = unit(centers[pairs[:, 0]] - centers[pairs[:, 1]])
+    directions = unit(directions + noise * rng.normal(size=directions.shape))
+    directions[2:21] = unit(rng.normal(size=(19, 3)))
+    placed = place(ViewGraph(40, pairs, directions))
+    assert np.isfinite(placed.covariances[1:]).all()
+    assert np.isfinite(placed.covariances[0]).all() == is_known
 
 
 @pytest.mark.parametrize("seed", range(3))
