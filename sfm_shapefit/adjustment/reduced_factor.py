@@ -67,9 +67,9 @@ def choose_factor(layout: Layout, options: AdjustmentOptions) -> InvertedFactor:
     """Return an empty factor as the options ask, dense without unknowns; sparse where steps are iterative."""
     is_dense = _is_dense(layout, options)
     return (
-        DenseFactor.plan(layout, options.num_threads())
+        DenseFactor.plan(layout, options.threads)
         if is_dense
-        else SparseFactor.of(layout, options.num_threads(), np.float64)
+        else SparseFactor.of(layout, options.threads, np.float64)
     )
 
 
@@ -78,10 +78,10 @@ def choose_solver(
 ) -> ReducedFactor:
     """Return what the systems of steps are solved with, as the options ask."""
     if _is_dense(layout, options):
-        return DenseFactor.plan(layout, options.num_threads())
+        return DenseFactor.plan(layout, options.threads)
     if options.linear_solver == "iterative":
         return IterativeFactor(problem, layout, workers)
-    return SparseFactor.of(layout, options.num_threads(), np.float32)
+    return SparseFactor.of(layout, options.threads, np.float32)
 
 
 def _is_dense(layout: Layout, options: AdjustmentOptions) -> bool:
