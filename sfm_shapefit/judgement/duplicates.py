@@ -69,8 +69,7 @@ def _find_duplicates(
     for batch in view.links(chosen=is_among(view.pairs, pairs)) if len(pairs) else ():
         first, second = (_places(images, pictures, batch, side) for side in (0, 1))
         near = np.zeros(len(batch.pairs), dtype=np.bool_)
-        given = batch.offsets, first, second, near
-        in_ranges(threads, len(near), _find_near, *given)
+        in_ranges(threads, len(near), _find_near, batch.offsets, first, second, near)
         found.append(batch.pairs[near])
     return np.concatenate(found)
 
@@ -78,9 +77,9 @@ def _find_duplicates(
 def _places(images: Images, pictures: Pictures, batch: KeypointMatches, side: int) -> FloatArray:
     """Return where the matches of pairs are in their first or second image, (M, 2), in its widths."""
     image_of = np.repeat(batch.pairs[:, side], np.diff(batch.offsets))
-    order, (present, begins) = np.argsort(image_of, kind="stable"), np.unique(image_of, return_counts=True)
+    order, (present, counts) = np.argsort(image_of, kind="stable"), np.unique(image_of, return_counts=True)
     places = np.empty((len(image_of), 2))
-    for image, rows in zip(present.tolist(), np.split(order, np.cumsum(begins)[:-1]), strict=True):
+    for image, rows in zip(present.tolist(), np.split(order, np.cumsum(counts)[:-1]), strict=True):
         width = max(images.lenses[images.lens_of[image]].width, 1)
         places[rows] = pictures.pixels(image, batch.keypoints[rows, side]) / width
     return places
