@@ -51,7 +51,8 @@ def held_by_chance(graph: ViewGraph, agrees: BoolArray, level_rad: float) -> Int
     a half circle of directions: with odds of about `level_rad`, and its power d - 2 in d dimensions.
     """
     pairs = graph.degrees().astype(np.float64)
-    is_likely = 0.5 * pairs * (pairs - 1.0) * level_rad ** (graph.dimension - 2) > RARE
+    others = 0.5 * pairs * (pairs - 1.0) - 1.0  # twos of pairs, but for one
+    is_likely = others * level_rad ** (graph.dimension - 2) > RARE
     by_chance = np.zeros(graph.num_nodes, dtype=np.bool_)
     while True:
         holding = graph.edges[agrees & ~by_chance[graph.edges].any(axis=1)]

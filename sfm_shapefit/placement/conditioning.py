@@ -101,7 +101,8 @@ def condition(
         is_straight = _is_straight(locations[members])
         for camera in members.tolist():
             causes[camera] = _cause(int(num_pairs[camera]), float(narrowness[camera]), float(largest[camera]))
-            if is_undetermined[camera] and num_pairs[camera] > FEW_PAIRS:
+            is_parallel = narrowness[camera] < NEARLY_PARALLEL
+            if is_undetermined[camera] and (is_parallel or num_pairs[camera] > FEW_PAIRS):
                 causes[camera] = Looseness.DISTANCE
             elif is_straight:
                 causes[camera] = Looseness.ON_A_LINE
