@@ -25,6 +25,8 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 from typing import Any as _Any
 
+from sfm_shapefit.base.display import write_by as _write_by
+
 if TYPE_CHECKING:
     from sfm_shapefit.adjustment.options import AdjustmentOptions
     from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
@@ -43,9 +45,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.judgement.options import TrustOptions
     from sfm_shapefit.pairs.options import DirectionOptions
     from sfm_shapefit.pipeline.adjust import AdjustedModel, bundle_adjust
-    from sfm_shapefit.pipeline.check import check
-    from sfm_shapefit.pipeline.check_pieces import check_pieces
-    from sfm_shapefit.pipeline.checked import CheckResult
+    from sfm_shapefit.pipeline.check import check, check_pieces
     from sfm_shapefit.pipeline.convert import convert
     from sfm_shapefit.pipeline.drop_in import average_database, global_mapping
     from sfm_shapefit.pipeline.evaluate import evaluate
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.map import map_database
     from sfm_shapefit.pipeline.match import match_images
     from sfm_shapefit.pipeline.place import place
+    from sfm_shapefit.pipeline.referee import CheckResult
     from sfm_shapefit.pipeline.relative_rotations import relative_rotations
     from sfm_shapefit.pipeline.workspace import Workspace, workspace
     from sfm_shapefit.pipeline.write import WriteOptions, write_result
@@ -75,9 +76,8 @@ _HOMES = {
     "files.options": ("MatchingOptions",),
     "adjustment.options": ("AdjustmentOptions",),
     "pipeline.adjust": ("AdjustedModel", "bundle_adjust"),
-    "pipeline.check": ("check",),
-    "pipeline.check_pieces": ("check_pieces",),
-    "pipeline.checked": ("CheckResult",),
+    "pipeline.check": ("check", "check_pieces"),
+    "pipeline.referee": ("CheckResult",),
     "pipeline.convert": ("convert",),
     "pipeline.drop_in": ("average_database", "global_mapping"),
     "pipeline.evaluate": ("evaluate",),
@@ -166,6 +166,8 @@ __all__ = [
     "workspace",
     "write_result",
 ]
+
+_write_by(lambda: _import_module("sfm_shapefit.pipeline.write").WRITERS)
 
 
 def __getattr__(name: str) -> _Any:

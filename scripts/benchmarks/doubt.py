@@ -30,11 +30,11 @@ from harness.record import Row, at_least, at_most
 from harness.scenes import WRONG_DEG, rotation_errors_deg, set_rotation, temporary_scene
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.judged import judge as judge_placement
 from sfm_shapefit.pairs.pair_directions import PairDirections
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.measure import Measured, Wanted, add_evidence, build_graph, measure, wants_points

@@ -16,7 +16,7 @@ from sfm_shapefit.base.errors import InputError
 
 if TYPE_CHECKING:
     from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
-    from sfm_shapefit.pipeline.world import World
+    from sfm_shapefit.files.colmap.world import World
 
 _POINTS = "_points.ply"  # behind the stem of a transforms.json
 
@@ -103,10 +103,11 @@ def write_converted(
 ) -> Converted:
     """Write a model in another format, in a system and with an offset; `convert` raises the same."""
     # Here, so that the command line knows the formats without loading pycolmap.
+    from sfm_shapefit.facts.tables import model_datum
     from sfm_shapefit.files.colmap.listed_poses import read_by_itself
     from sfm_shapefit.files.colmap.model import model_of, read_model
     from sfm_shapefit.files.colmap.reconstructions import transform_model
-    from sfm_shapefit.pipeline.world import world_of
+    from sfm_shapefit.files.colmap.world import world_of
     from sfm_shapefit.pipeline.write import refuse_file
 
     name = target_format or _format_of(path)
@@ -120,7 +121,7 @@ def write_converted(
     model = read_by_itself(source, with_lenses=name not in {"tum", "csv"})
     notes = model.notes
     centers = model.images.centers
-    world = world_of(given, centers, *coordinates)
+    world = world_of(model_datum(given) if coordinates[0] else None, centers, *coordinates)
     told = world.statement
     if not (world.is_own or FORMATS[name].is_exact):
         model = read_model(transform_model(model.reconstruction, world.similarity(centers)))

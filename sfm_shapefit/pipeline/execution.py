@@ -19,9 +19,9 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import MissingExtraError
 from sfm_shapefit.base.executors import Answer, WorkerError, answers
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.scene.matches import MatchBatch, MatchPart, View
 
 MATCHES_PER_TASK = 1_000_000

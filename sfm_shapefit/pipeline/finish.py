@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, hand_back_memory
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
 from sfm_shapefit.facts.result import NO_POINTS, LocateResult
@@ -24,7 +25,6 @@ from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.pipeline.adjustment import turned_deg
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, gauge_rule
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, coincide

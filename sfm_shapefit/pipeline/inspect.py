@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.inspected import Inspection
@@ -11,7 +12,6 @@ from sfm_shapefit.files.colmap.listed_poses import is_list, read_source
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.conventions import naming_convention
 from sfm_shapefit.pipeline.doubts import confirm_rotations
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
@@ -58,7 +58,7 @@ def inspect(
             points="no: a bare graph has no matches",
             diagnosis=diagnose(graph, options.placement),
         )
-    clock = Clock.of(progress, options.placement.solver)
+    clock = Clock.of(progress, options.placement.solver.threads)
     with clock("read"):
         model, _ = read_source(source, database, rotations_suffice=True)
         inputs = choose_inputs(source, database, options.source.directions)

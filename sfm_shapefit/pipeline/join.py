@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
 from sfm_shapefit.base.settings import flat_values, merge_options
@@ -27,7 +27,6 @@ from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model, renamed_as
 from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.pipeline.adjust import bundle_adjust
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out, see_matches
 from sfm_shapefit.pipeline.joined import JoinedGroup, Told, tell_group
 from sfm_shapefit.pipeline.mapping import MapRun
@@ -35,7 +34,6 @@ from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces, tie_pieces
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
 from sfm_shapefit.placement.prior_join import PlacedByPriors, join_by_priors, place_by_priors
 from sfm_shapefit.scene.given import PositionPriors
-from sfm_shapefit.solver.options import SolverOptions
 
 if TYPE_CHECKING:
     import pycolmap
@@ -72,7 +70,7 @@ def join(
         UnsolvableError: if no two models can be joined safely; the message says why.
     """
     options = merge_options(options, JoinOptions, overrides)
-    clock = Clock.of(progress, SolverOptions())
+    clock = Clock.of(progress)
     with clock("read"):
         if isinstance(models, Path | str) or len(models) < 2:
             raise InputError("a join needs two models or more; give their folders one after the other")

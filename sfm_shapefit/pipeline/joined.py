@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, compose
 from sfm_shapefit.facts.joins import Joined
@@ -30,10 +31,9 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import name_of, transform_model
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pipeline.checked import check_source
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import gauge_of_distances
 from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.options import KnownDistance
 

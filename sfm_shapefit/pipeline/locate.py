@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
@@ -20,7 +20,6 @@ from sfm_shapefit.files.colmap.listed_poses import read_source
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
 from sfm_shapefit.pipeline.gauge_choice import between_images, read_known
 from sfm_shapefit.pipeline.inputs import (
@@ -83,7 +82,7 @@ def locate(
     Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """
     options = merge_options(options, LocateOptions, overrides)
-    clock = Clock.of(progress, options.placement.solver, executor)
+    clock = Clock.of(progress, options.placement.solver.threads, executor)
     with ExitStack() as stack:
         with clock("read"):
             model, listed = read_source(reconstruction, database, rotations_suffice=True)

@@ -11,6 +11,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.map_result import MapResult, tell_joins
@@ -20,7 +21,6 @@ from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.join import join_mapped
 from sfm_shapefit.pipeline.mapping import MapRun, locate_components, refine_intrinsics, start_run
 from sfm_shapefit.rotations.sequences import Videos, Visit
@@ -63,7 +63,7 @@ def map_database(
         WorkerError: if a worker died and the executor does not replace it.
     """
     options = merge_options(options, MapOptions, overrides)
-    clock = Clock.of(progress, options.placement.solver, executor)
+    clock = Clock.of(progress, options.placement.solver.threads, executor)
     with closing(DatabaseFile(database_in(Path(database)))) as file:
         return map_opened(file, options, clock, priors)
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.wording import counted
@@ -30,7 +31,6 @@ from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
 from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import between_images, read_known
 from sfm_shapefit.pipeline.inputs import (
     MatchSource,

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.facts.options import InspectOptions, PlacingOptions
@@ -18,7 +19,6 @@ from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_directi
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.memory import Economy, Workload, describe_work, keep_within_memory

@@ -16,6 +16,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.sources import collect_matches
 from sfm_shapefit.adjustment.structure import triangulate
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.wording import counted
@@ -26,7 +27,6 @@ from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, Shared, choose_pairs
 from sfm_shapefit.judgement.evidence import PairFits
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.evidence import Structure
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.matches import is_among

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.base.settings import merge_options
@@ -22,12 +22,11 @@ from sfm_shapefit.files.onedsfm import EpipolarGeometries, is_onedsfm, read_oned
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import judge
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.placement.place import place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.posterior import weigh_by_triangles
 from sfm_shapefit.rotations.average import average_rotations
-from sfm_shapefit.solver.options import OnIteration
+from sfm_shapefit.solver.options import OnIteration, reported
 
 if TYPE_CHECKING:
     import pycolmap
@@ -174,7 +173,7 @@ def place_graph_file(
         UnsolvableError: if the directions determine nothing.
     """
     options = merge_options(options, PlacementOptions, overrides)
-    clock = Clock.of(progress, options.solver)
+    clock = Clock.of(progress, options.solver.threads)
     statement = "directions as given"
     with clock("read"):
         geometries = _relative_poses(path)
@@ -193,7 +192,7 @@ def place_graph_file(
             bare = ViewGraph(bare.num_nodes, bare.edges, -bare.directions, bare.weights, bare.names)
         graph = MeasuredGraph(bare)
     with clock("solve"):
-        placed = list(place_pieces(graph, options, on_iteration=clock.iteration))
+        placed = list(place_pieces(graph, options, on_iteration=reported(clock.advance)))
     with clock("trust"):
         judged = [judge(piece, options) for piece in placed]
     return GraphResult(

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, rank_within
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
@@ -23,7 +24,6 @@ from sfm_shapefit.pairs.essential import (
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import LEAST_MATCHES, DirectionOptions
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.scene.matches import RayMatches, View
@@ -76,7 +76,7 @@ def relative_rotations(
     """
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
-    clock = Clock.of(progress, SolverOptions(threads=threads), executor)
+    clock = Clock.of(progress, SolverOptions(threads=threads).threads, executor)
     with clock("relative rotations"), closing(DatabaseFile(database)) as file:
         images = read_images(file).images
         view = DatabaseMatches(file, images.names).at(images.apart())

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.judgement.wrong_lenses import is_like_others
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.conventions import ask_resolution
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
 from sfm_shapefit.pipeline.rigs import measure_hold

@@ -16,6 +16,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, hand_back_memory
 from sfm_shapefit.base.blas_threads import one_blas_thread
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.options import FIX_SOLVED, PlacingOptions
 from sfm_shapefit.files.colmap.model import ColmapModel
@@ -24,13 +25,13 @@ from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.verdicts import Hold, find_hold
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.measure import Measured, add_evidence, build_graph
 from sfm_shapefit.placement.gauge import coincide
 from sfm_shapefit.placement.place import Near, Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
+from sfm_shapefit.solver.options import reported
 from sfm_shapefit.solver.tied import largest_tied
 from sfm_shapefit.tracks.options import NodeOptions
 
@@ -113,7 +114,7 @@ def place_cameras(
     """
     hand_back_memory()  # what the graph was made of is gone
     placed = partial(
-        place_pieces, options=options, near=near, certified=certified, on_iteration=clock.iteration
+        place_pieces, options=options, near=near, certified=certified, on_iteration=reported(clock.advance)
     )
     if not measured.has_scale or not measured.num_points or nodes.points == "always":
         yield from placed(measured)

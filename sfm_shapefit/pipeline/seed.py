@@ -11,6 +11,7 @@ from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import BoolArray, hand_back_memory
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.support import (
@@ -20,7 +21,6 @@ from sfm_shapefit.judgement.support import (
     images_of_few_points,
     images_without_support,
 )
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points

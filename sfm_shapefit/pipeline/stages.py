@@ -19,6 +19,7 @@ from functools import partial
 
 import numpy as np
 
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.base.wording import counted, first_of
@@ -26,7 +27,6 @@ from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.doubted import confirm_cameras
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_cameras, with_uncertainty
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
 from sfm_shapefit.pipeline.evidence import confirm_by_pixels, open_beyond_noise, question, shape_of
 from sfm_shapefit.pipeline.finish import finish_model

@@ -21,6 +21,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.pairs.essential import (
     concatenate_rotations,
@@ -29,7 +30,6 @@ from sfm_shapefit.pairs.essential import (
     refine_rough_rotations,
 )
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import choose_frame
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
 from sfm_shapefit.pipeline.measure import Wanted, measure, wants_points

@@ -16,10 +16,12 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from sfm_shapefit.base.atomic_folder import atomic_folder
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, angle_between_deg
 from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.wording import counted, counted_are, first_of
+from sfm_shapefit.facts.tables import model_datum
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, model_of, read_model
 from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
@@ -27,12 +29,9 @@ from sfm_shapefit.files.colmap.pinholes import flats_of, flatten_model, write_fl
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
 from sfm_shapefit.files.nerf import nerf_text
-from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.pipeline.evaluate import model_datum
 from sfm_shapefit.report.mesh import ply_bytes
 from sfm_shapefit.rotations.gravity import DOWN, turn_upright
 from sfm_shapefit.scene.level import find_up
-from sfm_shapefit.solver.options import SolverOptions
 
 if TYPE_CHECKING:
     import pycolmap
@@ -95,7 +94,7 @@ def workspace(
     if level not in LEVELS:
         raise InputError(f"level must be auto or never, got {level!r}")
     refuse_no_folder(Path(images))
-    clock = Clock.of(progress, SolverOptions())
+    clock = Clock.of(progress)
     with clock("read"):
         read = read_by_itself(model_of(model), with_lenses=True)
         turn, said = _level(read, model) if level == "auto" else (None, "its axes stay, as asked")

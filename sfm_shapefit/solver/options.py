@@ -1,16 +1,17 @@
 """What the solver is told and what it answers: data alone, cheap to import."""
 
 import enum
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.settings import Settings, explained, option
+from sfm_shapefit.base.threads import MAX_THREADS, count_threads
 
 if TYPE_CHECKING:  # numpy is not cheap
     from sfm_shapefit.base.arrays import FloatArray
+    from sfm_shapefit.base.executors import Advance
 
 Solver = Literal["auto", "newton", "admm", "conic"]
 
@@ -23,9 +24,6 @@ PAIRS_AT_SCALE = 1_000_000
 # Gap and iterations of a start at scale. A few cameras that hang by few right pairs creep for hundreds of
 # iterations: boxes of 1e5, 60 % wrong, come to 3e-6 in 36, to 2e-6 in 60, to 1.4e-6 in none of 186.
 _TOL_OF_MANY, _ITERATIONS_OF_MANY = 1e-6, 60
-
-MAX_THREADS = 256
-"""Threads that may be asked for; work is cut into as many shares, so that millions would never end."""
 
 
 class Status(enum.Enum):
@@ -55,6 +53,11 @@ class IterationInfo:
 
 OnIteration = Callable[[IterationInfo], bool | None]
 """Called after each iteration; returning False, or raising, cancels the solve."""
+
+
+def reported(advance: "Advance") -> OnIteration:
+    """Return a callback that reports each iteration: of at most so many, for fewer may do."""
+    return lambda info: advance(info.iteration, max(info.limit, info.iteration))
 
 
 def asks_to_stop(on_iteration: OnIteration | None, info: IterationInfo) -> bool:
@@ -138,7 +141,7 @@ class SolverOptions(Settings):
 
     def num_threads(self) -> int:
         """Return the number of threads to use."""
-        return self.threads or min(os.cpu_count() or 1, MAX_THREADS)
+        return count_threads(self.threads)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

@@ -15,7 +15,7 @@ from sfm_shapefit.judgement.grade import weigh_evidence
 from sfm_shapefit.judgement.image_quality import image_quality
 from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason
-from sfm_shapefit.pipeline import checked
+from sfm_shapefit.pipeline import referee as checked
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.map import map_database
 from sfm_shapefit.report.drawing import PairClass

@@ -9,14 +9,14 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline import evidence
 from sfm_shapefit.pipeline.check import check
-from sfm_shapefit.pipeline.checked import check_source
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import inputs_from, open_source
+from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.solver.options import SolverOptions

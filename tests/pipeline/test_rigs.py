@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit import InputError, LocateOptions, UnsolvableError
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.geometry import fit_similarity, rotation_angles_deg
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
@@ -25,7 +26,6 @@ from sfm_shapefit.pipeline import adjustment as adjustment_stage
 from sfm_shapefit.pipeline import doubts as doubts_stage
 from sfm_shapefit.pipeline import measure as measure_stage
 from sfm_shapefit.pipeline import rigs as rigs_stage
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.convert import convert
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.inputs import MatchSource

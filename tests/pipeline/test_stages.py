@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit import LocateOptions
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import (
     angle_between_deg,
@@ -25,7 +26,6 @@ from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_of_rotations, turned_deg
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import doubt_cameras
 from sfm_shapefit.pipeline.finish import finish_model
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule, gauge_rule
