@@ -12,8 +12,8 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
+from sfm_shapefit.pipeline.components import start_run
 from sfm_shapefit.pipeline.map import map_database, measure_run
-from sfm_shapefit.pipeline.mapping import start_run
 from sfm_shapefit.pipeline.write import WriteOptions, deliver
 from sfm_shapefit.scene.points import number_points
 

@@ -1,7 +1,6 @@
 """Ask for evidence that the fit did not use: of our own models, and of any that is looked at."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,27 +26,15 @@ from sfm_shapefit.judgement.wrong_lenses import question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.state import ModelState
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import View
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 from sfm_shapefit.tracks.links import ObservedTracks
 
 _OPEN = 1e100  # squared units; larger covariances overflow, and mean that nothing holds a camera
 _MOST_ASKED = 200  # images of a lens that are left out; each takes 1.4 ms, and a median of so many is exact
-
-
-class Structure(NamedTuple):
-    """The points of a model, and what they are seen with."""
-
-    points: Points
-    images: Images
-    """Images where the model has them; NaN where it does not."""
-    pictures: Pictures
-    among: BoolArray | None = None
-    """(i,) images that make the points; all if None."""
-    asked: BoolArray | None = None
-    """(i,) images that are asked whether they contradict their lenses; all if None."""
 
 
 def gather_evidence(

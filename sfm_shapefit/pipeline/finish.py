@@ -7,7 +7,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, hand_back_memory
 from sfm_shapefit.base.clock import Clock
-from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1
+from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, turned_deg
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
 from sfm_shapefit.facts.result import NO_POINTS, LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
@@ -24,10 +24,9 @@ from sfm_shapefit.facts.warnings import (
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.judgement.uncertainty import standard_deviations
-from sfm_shapefit.pipeline.adjustment import turned_deg
-from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, gauge_rule
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, coincide
+from sfm_shapefit.placement.gauge_rule import SETS_SCALE
 from sfm_shapefit.placement.prior_fit import PriorFit, compare_with_priors
 
 
@@ -106,7 +105,7 @@ def _warnings(found: LocateResult, state: ModelState) -> Iterator[str]:
         yield f"{NO_POINTS}; bundle adjustment has nothing to start from"
     yield from prior_warnings(found.prior_fit, images.names)
     there = np.flatnonzero(images.is_posed)
-    yield from gauge_rule(state).check(gauge, there, images.centers[there])
+    yield from state.gauge_rule.check(gauge, there, images.centers[there])
     if options.gauge.scale == "unit" and gauge.scale != "unit":
         yield f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}"
     unsupported = [images.names[k] for k in np.flatnonzero(found.unsupported).tolist()]

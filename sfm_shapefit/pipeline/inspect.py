@@ -15,10 +15,11 @@ from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.conventions import naming_convention
 from sfm_shapefit.pipeline.doubts import confirm_rotations
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
-from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, count_work, measure, wants_points
-from sfm_shapefit.pipeline.memory import describe_work, forecast
-from sfm_shapefit.pipeline.rigs import find_rigid_parts, rigs_statement
+from sfm_shapefit.pipeline.measure import MeasureRequest, add_evidence, build_graph, measure, wants_points
+from sfm_shapefit.pipeline.memory import count_work, describe_work, forecast
+from sfm_shapefit.pipeline.placing import rigs_statement
 from sfm_shapefit.placement.diagnosis import diagnose
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 
 
 def inspect(
@@ -66,12 +67,12 @@ def inspect(
     images = model.images
     with open_source(model, inputs) as matches:
         with clock("directions"):
-            wanted = Wanted(tracks=wants_points(matches, options.nodes))
+            wanted = MeasureRequest(tracks=wants_points(matches, options.nodes))
             measured = measure(matches, options.directions, clock, wanted)
             directions = measured.directions
         with clock("diagnosis"), naming_convention(matches, clock.threads):
             with_points = add_evidence(build_graph(images, measured, options.nodes), measured)
-            grouped = find_rigid_parts(images).apply(with_points)
+            grouped = find_fixed_and_rigged(images).apply(with_points)
             work = describe_work(grouped, count_work(matches, directions, options), options.placement)
             confirmed = confirm_rotations(matches, directions, clock.threads)
             return Inspection(
@@ -80,7 +81,7 @@ def inspect(
                 statuses={status.value: count for status, count in directions.counts().items()},
                 points=options.nodes.points_statement(images.num_images, with_points.num_points),
                 diagnosis=diagnose(with_points, options.placement, confirmed),
-                expected=forecast(work, matches.economy),
+                expected=forecast(work, matches.memory_plan),
                 rigs=rigs_statement(images, grouped),
                 warnings=(*model.notes, *matches.matches.notes),
             )

@@ -19,9 +19,7 @@ from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.listed_poses import read_source
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.template import template_of
-from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
-from sfm_shapefit.pipeline.gauge_choice import between_images, read_known
 from sfm_shapefit.pipeline.inputs import (
     RunInputs,
     choose_inputs,
@@ -30,8 +28,9 @@ from sfm_shapefit.pipeline.inputs import (
     see_matches,
     settle_intrinsics,
 )
+from sfm_shapefit.pipeline.known import between_images, pull_of_rotations, read_fixed_images, read_known
+from sfm_shapefit.pipeline.memory import see_within_limit
 from sfm_shapefit.pipeline.remedies import make_model
-from sfm_shapefit.pipeline.rigs import read_fixed_images
 
 _ROUGH_RAD = np.radians(0.3)  # radians; directions of pairs are not measured by rotations farther off
 _NOT_CORRECTED = "rough rotations beside fixed images are not corrected; --fix needs better ones"
@@ -103,7 +102,7 @@ def locate(
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)
             notes = (*model.notes, *matches.notes)
             del model  # whose points and keypoints are large
-            source = see_matches(matches, images, inputs, options)
+            source = see_within_limit(see_matches(matches, images, inputs), options)
         pull_rad = pull_of_rotations(options.rotations)
         is_rough = pull_rad is not None and _ROUGH_RAD <= pull_rad < np.inf
         if is_rough and fixed.any():

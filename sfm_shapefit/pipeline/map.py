@@ -21,8 +21,8 @@ from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.join import join_mapped
-from sfm_shapefit.pipeline.mapping import MapRun, locate_components, refine_intrinsics, start_run
+from sfm_shapefit.pipeline.components import MapContext, start_run
+from sfm_shapefit.pipeline.mapping import join_mapped, locate_components, refine_intrinsics
 from sfm_shapefit.rotations.sequences import Videos, Visit
 from sfm_shapefit.scene.lens import FOCAL
 
@@ -108,7 +108,7 @@ def map_opened(
     return tell_joins(result)
 
 
-def measure_run(run: MapRun) -> tuple[MapRun, RelativeRotations, Videos, tuple[Visit, ...]]:
+def measure_run(run: MapContext) -> tuple[MapContext, RelativeRotations, Videos, tuple[Visit, ...]]:
     """Return the relative rotations of all pairs that are believed, videos, and visits.
 
     The run knows scores of the pairs then, and which ones are refused.

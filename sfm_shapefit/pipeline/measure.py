@@ -1,7 +1,7 @@
 """From matches to the problem that is solved: directions, the view graph with its points, the evidence."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -11,17 +11,16 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
-from sfm_shapefit.facts.options import InspectOptions, PlacingOptions
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
+from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.memory import Economy, Workload, describe_work, keep_within_memory
 from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, is_among, rows_of_pairs
@@ -47,24 +46,7 @@ _ADVICE = {
 """What to do where no pair has a direction, by the most frequent reason."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Measured:
-    """What one pass over the matches yields."""
-
-    directions: PairDirections
-    """Directions of all pairs, usable or not."""
-    tracks: TrackJoiner | None = None
-    """Joins points seen by three cameras or more, which may become nodes; None where not asked for."""
-    checks: bool = False
-    """Whether those are known, and were asked for, that no single match holds together."""
-    errors: list[FloatArray] | None = None
-    """Samples of the usable directions' errors, which share keypoints, (m, NUM_SAMPLES, 2) in parts. None
-    where directions count as independent."""
-    facts_per_match: float = 1.0
-    """See `Evidence`."""
-
-
-class Wanted(NamedTuple):
+class MeasureRequest(NamedTuple):
     """What a pass over the matches is to tell beside the directions."""
 
     tracks: PointNodes = "never"
@@ -72,16 +54,16 @@ class Wanted(NamedTuple):
     checked: bool = False
     errors: bool = False
     facts: bool = False
-    """Whether `Measured.facts_per_match` is told."""
+    """Whether `MeasuredPairs.facts_per_match` is told."""
 
 
-DIRECTIONS = Wanted()
+DIRECTIONS_ALONE = MeasureRequest()
 """Nothing beside them."""
 
 
 def measure(
-    source: MatchSource, options: DirectionOptions, clock: Clock, wanted: Wanted = DIRECTIONS
-) -> Measured:
+    source: MatchSource, options: DirectionOptions, clock: Clock, wanted: MeasureRequest = DIRECTIONS_ALONE
+) -> MeasuredPairs:
     """Measure the direction of every pair of a source, and what is wanted beside, in one pass.
 
     Pairs of two fixed images are left out.
@@ -92,13 +74,13 @@ def measure(
     Raises:
         UnsolvableError: if no pair has a match.
     """
-    beside, without = _Beside(source, options.inlier_threshold_px, wanted), source.pairs_of_fixed
+    beside, without = _SideResults(source, options.inlier_threshold_px, wanted), source.pairs_of_fixed
     if clock.executor is not None and source.has_database:
         parts = measure_with_workers(source.view, partial(estimate_directions, options=options), clock)
         if without is not None and parts:
             every = concatenate(parts)
             parts = [every.subset(np.flatnonzero(~is_among(every.pairs, without)))]
-        if parts and wanted != DIRECTIONS:
+        if parts and wanted != DIRECTIONS_ALONE:
             for batch, directions in _again(source, concatenate(parts)):
                 beside.add(batch, directions)
     else:
@@ -118,7 +100,7 @@ def measure(
         beside.joiner = _new_joiner(source, options.inlier_threshold_px)
         for batch, own in _again(source, directions):
             beside.joiner.add(batch, own)
-    return Measured(
+    return MeasuredPairs(
         directions=directions,
         tracks=beside.joiner,
         checks=wanted.checked and beside.joiner is not None and beside.joiner.holds_all,
@@ -137,10 +119,15 @@ def _again(source: MatchSource, directions: PairDirections) -> Iterator[tuple[Ma
         yield batch, directions.subset(rows_of_pairs(batch.pairs, directions.pairs))
 
 
-class _Beside:
+def are_sampled(num_usable: int, num_pairs: int) -> bool:
+    """Return whether the errors of so many usable directions, of so many pairs, are sampled."""
+    return num_usable <= _MAX_SAMPLED_PAIRS and num_pairs <= _MOST_PAIRS
+
+
+class _SideResults:
     """What is made of each batch beside its directions."""
 
-    def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted) -> None:
+    def __init__(self, source: MatchSource, threshold_px: float, wanted: MeasureRequest) -> None:
         view = source.view
         self._threshold_px, self._num_usable, self._counts_pairs = threshold_px, 0, wanted.facts
         is_sampled = wanted.errors and view.num_pairs <= _MOST_PAIRS
@@ -197,12 +184,12 @@ def view_graph(images: Images, directions: PairDirections) -> ViewGraph:
 
 def wants_points(source: MatchSource, options: NodeOptions) -> PointNodes:
     """Return whether 3D points join the view graph, "auto" where that depends on what the pairs hold."""
-    is_wanted = options.uses_points(source.images.num_images) and source.economy.points
+    is_wanted = options.uses_points(source.images.num_images) and source.memory_plan.points
     return options.points if is_wanted else "never"
 
 
 def build_graph(
-    images: Images, measured: Measured, nodes: NodeOptions, *, checked: bool = False
+    images: Images, measured: MeasuredPairs, nodes: NodeOptions, *, checked: bool = False
 ) -> MeasuredGraph:
     """Return the graph of the usable directions, with 3D points as further nodes if there are tracks.
 
@@ -227,30 +214,7 @@ def _is_held_by_pairs(graph: ViewGraph) -> bool:
     return bool(is_spread) and is_parallel_rigid(graph.num_nodes, graph.edges, graph.dimension)
 
 
-def count_work(
-    source: MatchSource, directions: PairDirections, options: PlacingOptions | InspectOptions
-) -> Workload:
-    """Return the work to do, as far as it is known once the directions are measured."""
-    usable = directions.usable()
-    is_few = len(usable) <= _MAX_SAMPLED_PAIRS and len(directions.pairs) <= _MOST_PAIRS
-    return replace(
-        source.workload(options),
-        num_pairs=len(directions.pairs),
-        num_matches=int(directions.num_matches.sum()),
-        num_sampled=len(usable) if source.economy.samples and is_few else 0,
-    )
-
-
-def keep_within_limit(
-    graph: MeasuredGraph, source: MatchSource, measured: Measured, options: PlacingOptions
-) -> tuple[Economy, MeasuredGraph]:
-    """Return what is given up to stay below the limit of memory, and the graph then."""
-    work = count_work(source, measured.directions, options)
-    describe = partial(describe_work, work=work, options=options.placement)
-    return keep_within_memory(graph, describe, options.memory.max_memory_mb, source.economy)
-
-
-def add_evidence(graph: MeasuredGraph, measured: Measured) -> MeasuredGraph:
+def add_evidence(graph: MeasuredGraph, measured: MeasuredPairs) -> MeasuredGraph:
     """Return the graph with what the matches say of its cameras.
 
     The errors of directions to points are independent draws of their own covariance. The samples of

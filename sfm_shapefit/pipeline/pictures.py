@@ -27,9 +27,9 @@ from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, Shared, choose_pairs
 from sfm_shapefit.judgement.evidence import PairFits
-from sfm_shapefit.pipeline.evidence import Structure
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.matches import is_among
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.options import StructureOptions
 

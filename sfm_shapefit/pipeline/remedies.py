@@ -17,7 +17,7 @@ from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.judgement.wrong_lenses import is_like_others
 from sfm_shapefit.pipeline.conventions import ask_resolution
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
-from sfm_shapefit.pipeline.rigs import measure_hold
+from sfm_shapefit.pipeline.placing import measure_hold
 from sfm_shapefit.pipeline.stages import run_stages
 from sfm_shapefit.pipeline.starts import begin_model
 from sfm_shapefit.placement.gauge import UselessPriorsError
@@ -153,7 +153,7 @@ def find_remedies(found: LocateResult, inputs: RunInputs, source: MatchSource) -
     names = ((images.names[i], images.names[j]) for i, j in pairs.tolist())
     left_out = source.inputs.left_out | {(min(pair), max(pair)) for pair in names}
     read = replace(source.inputs, left_out=left_out)
-    view = source.matches.at(images.with_lenses(lenses), left_out, source.economy.reading)
+    view = source.matches.at(images.with_lenses(lenses), left_out, source.memory_plan.reading)
     yield Remedy(
         replace(inputs, intrinsics=replace(intrinsics, parts=parts)),
         replace(source, inputs=read, view=view),

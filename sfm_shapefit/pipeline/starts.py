@@ -30,12 +30,12 @@ from sfm_shapefit.pairs.essential import (
     refine_rough_rotations,
 )
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.gauge_choice import choose_frame
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
-from sfm_shapefit.pipeline.measure import Wanted, measure, wants_points
+from sfm_shapefit.pipeline.measure import MeasureRequest, measure, wants_points
+from sfm_shapefit.pipeline.placing import place_first
 from sfm_shapefit.pipeline.relative_rotations import estimate_here
-from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_first
 from sfm_shapefit.pipeline.state import ModelState
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 from sfm_shapefit.placement.place import Near
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
@@ -74,12 +74,12 @@ def adjust_first_placement(
     source, options, images = state.source, state.inputs.options, state.source.images
     with clock("first placement"):
         is_free = not state.rigid.has_scale  # offsets do what points do
-        wanted = Wanted(tracks=wants_points(source, options.nodes), checked=is_free)
+        wanted = MeasureRequest(tracks=wants_points(source, options.nodes), checked=is_free)
         measured = measure(source, options.directions, clock, wanted)
         placement = place_first(images, state.rigid, measured, options, clock)
         directions = replace(measured, tracks=None)
         del measured  # arrays of all pairs
-        placed = choose_frame(replace(state, measured=directions, placement=placement))
+        placed = replace(state, measured=directions, placement=placement).framed()
         start = placed.placed()
         rows = start.posed_rows
         adjusted = adjust_thinly(
@@ -103,7 +103,7 @@ def adjust_first_placement(
     return replace(
         state,
         source=source,
-        rigid=find_rigid_parts(source.images),
+        rigid=find_fixed_and_rigged(source.images),
         intrinsics=intrinsics,
         near=Near(centers, placement.refined),
         first=adjusted,

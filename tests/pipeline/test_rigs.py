@@ -25,13 +25,13 @@ from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline import adjustment as adjustment_stage
 from sfm_shapefit.pipeline import doubts as doubts_stage
 from sfm_shapefit.pipeline import measure as measure_stage
-from sfm_shapefit.pipeline import rigs as rigs_stage
+from sfm_shapefit.pipeline import placing as rigs_stage
 from sfm_shapefit.pipeline.convert import convert
-from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.join import judge_joins
+from sfm_shapefit.pipeline.joining import judge_joins
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.write import write_result
+from sfm_shapefit.placement.gauge_rule import GaugeRule
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.synthetic import (
@@ -193,7 +193,7 @@ def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace
     images, every = read_model(workspace / "truth").images, np.arange(36)
     apart = float(np.linalg.norm(images.centers[0] - images.centers[20]))
     distances = ((images.names[0], images.names[20], 2.0 * apart),)
-    rigid = rigs_stage.find_rigid_parts(images, every < 0)
+    rigid = rigs_stage.find_fixed_and_rigged(images, every < 0)
     rule = GaugeRule(images, rigid, "unit", made_priors(3.0 * images.centers), distances)
     chosen = rule.choose(every, 0.1 * images.centers, 0.1)
     assert chosen.scale == "rig"

@@ -17,22 +17,24 @@ from sfm_shapefit.base.geometry import (
     mean_rotation_l1,
     normalized,
     rotation_angles_deg,
+    turned_deg,
 )
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_of_rotations, turned_deg
+from sfm_shapefit.pipeline.adjustment import adjust_placed
 from sfm_shapefit.pipeline.doubts import doubt_cameras
 from sfm_shapefit.pipeline.finish import finish_model
-from sfm_shapefit.pipeline.gauge_choice import GaugeRule, gauge_rule
-from sfm_shapefit.pipeline.join import judge_joins, merge_groups
-from sfm_shapefit.pipeline.measure import Measured, Wanted, add_evidence, build_graph, measure
+from sfm_shapefit.pipeline.joining import judge_joins, merge_groups
+from sfm_shapefit.pipeline.known import pull_of_rotations
+from sfm_shapefit.pipeline.measure import MeasureRequest, add_evidence, build_graph, measure
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
-from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
+from sfm_shapefit.pipeline.placing import place_cameras
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
 from sfm_shapefit.pipeline.stages import (
     adjust_cameras,
@@ -44,6 +46,8 @@ from sfm_shapefit.pipeline.stages import (
     set_gauge,
 )
 from sfm_shapefit.pipeline.state import ModelState
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
+from sfm_shapefit.placement.gauge_rule import GaugeRule
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Near
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -69,7 +73,7 @@ def relative_rotations(model, turned=()):
 
 def test_measure_tells_directions_tracks_and_errors_of_one_pass_and_makes_a_graph_of_them():
     with opened() as source:
-        found = measure(source, DirectionOptions(), Clock(), Wanted(tracks="always", errors=True))
+        found = measure(source, DirectionOptions(), Clock(), MeasureRequest(tracks="always", errors=True))
         bare = measure(source, DirectionOptions(), Clock())
     i, j = found.directions.pairs[found.directions.usable()].T
     true = normalized(TRUTH.centers[i] - TRUTH.centers[j])
@@ -91,7 +95,7 @@ def test_measure_tells_directions_tracks_and_errors_of_one_pass_and_makes_a_grap
 
 def test_many_cameras_that_pairs_of_many_directions_hold_need_no_points(monkeypatch):
     with opened() as source:
-        found = measure(source, DirectionOptions(), Clock(), Wanted(tracks="always"))
+        found = measure(source, DirectionOptions(), Clock(), MeasureRequest(tracks="always"))
     parallel = np.where(np.isfinite(found.directions.directions), [1.0, 0.0, 0.0], np.nan)
     flat = replace(found, directions=replace(found.directions, directions=parallel))
     degree = int(build_graph(TRUTH, found, NodeOptions(points="never")).graph.degrees().min())
@@ -104,9 +108,9 @@ def test_many_cameras_that_pairs_of_many_directions_hold_need_no_points(monkeypa
     monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_PAIRS", 2)
     assert [has_points(found), has_points(found, "always"), has_points(flat)] == [False, True, True]
     with opened() as source:
-        assert measure(source, DirectionOptions(), Clock(), Wanted(tracks="auto")).tracks is None
+        assert measure(source, DirectionOptions(), Clock(), MeasureRequest(tracks="auto")).tracks is None
         monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_PAIRS", degree + 6)
-        again = measure(source, DirectionOptions(), Clock(), Wanted(tracks="auto", checked=True))
+        again = measure(source, DirectionOptions(), Clock(), MeasureRequest(tracks="auto", checked=True))
     assert has_points(found)
     assert again.checks
     own, usual = again.tracks.tracks(), found.tracks.tracks()  # joined after all directions were known
@@ -129,7 +133,7 @@ def test_a_further_piece_begins_without_what_is_known_of_positions():
     with opened() as source:
         told = {"scale": "input", "priors": made_priors(TRUTH.centers)}
         known = replace(state_at(source, TRUTH.centers, **told).inputs, fixed=np.arange(8) == 4)
-        measured = Measured(directions=directions_of(TRUTH, edges))
+        measured = MeasuredPairs(directions=directions_of(TRUTH, edges))
         state = replace(ModelState.of(known, source), measured=measured)
         first, second = place_rigid_pieces(state, Clock())
     assert [one.placement.cameras.tolist() for one in (first, second)] == [[3, 4, 5, 6, 7], [0, 1, 2, 3]]
@@ -340,7 +344,7 @@ TURNED_PRIORS = {"priors": made_priors(2.0 * (TRUTH.centers + OFF) @ TURN.T + 10
     ],
 )
 def test_gauge_the_first_by_precedence_sets_the_scale_and_the_others_check_it(fixed, told, scale, checks):
-    locations, rigid = 0.1 * TRUTH.centers, find_rigid_parts(TRUTH, np.arange(8) < fixed)
+    locations, rigid = 0.1 * TRUTH.centers, find_fixed_and_rigged(TRUTH, np.arange(8) < fixed)
     rule = GaugeRule(TRUTH, rigid, **{"scale": "auto", **told})
     chosen = rule.choose(np.arange(8), locations, 0.1 if fixed > 1 else None)
     assert chosen.scale == scale
@@ -376,7 +380,7 @@ def test_seed_has_the_scale_the_origin_and_the_axes_that_are_told_also_where_all
         found = set_gauge(seed_points(state, Clock()))
     assert (found.bundle is not None) == (adjust == "full")
     centers = found.images.centers
-    again = gauge_rule(state).choose(np.arange(8), centers, None)  # what is told holds already
+    again = state.gauge_rule.choose(np.arange(8), centers, None)  # what is told holds already
     assert again.scale == found.gauge.scale
     axes = np.eye(3) if found.gauge.axes is None else found.gauge.axes
     exact = 1e-4 if told is TURNED_PRIORS else 1e-9  # a robust fit is no fixed point after twenty rounds
