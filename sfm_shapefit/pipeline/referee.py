@@ -1,15 +1,16 @@
 """The verdict on a COLMAP model as it stands, whose matches are open; nothing is placed.
 
-Which pairs contradict the model `judgement.evidence` says. A camera is weak if it sees fewer than 30 points,
-if its reprojection error is above 0.75 px and above twice what is usual, or if more than a third of its pairs
-contradict it, and more than twice the usual share. How much of the picture its points cover is told, and
-decides nothing: on an object before a plain wall they cover little.
+    read_structure            the model's points, and which images they hold weakly
+    fit_directions            directions of all pairs, against where the cameras stand
+    gather_evidence_against   `evidence`: the same as of a model that `locate` has made
+    compare_with_other        a second opinion
+    grade_model               the verdict
+    finish_check              the result
 
-A model cannot be judged if it has two cameras only, or if its pairs say nothing of where its cameras stand.
-It is not to be used for the evidence of `judgement.grade`; else its weak cameras are to be looked at.
-
-The limits are set by the bundled scenes and twelve sound models of COLMAP, see "What `check` calls weak" in
-scripts/results/notes.md.
+Which pairs contradict the model `judgement.evidence` says, and which images are weak
+`judgement.image_quality`. A model cannot be judged if it has two cameras only, or if its pairs say nothing of
+where its cameras stand. It is not to be used for the evidence of `judgement.grade`; else its weak cameras are
+to be looked at.
 """
 
 from collections import Counter
@@ -36,9 +37,9 @@ from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
-from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
+from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, fit_pairs
 from sfm_shapefit.judgement.grade import too_few_to_judge, weigh_evidence
-from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
+from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
 from sfm_shapefit.judgement.reasons import (
     ARE_ITS_PICTURES,
     IS_ITS_DATABASE,
@@ -46,7 +47,6 @@ from sfm_shapefit.judgement.reasons import (
     Kind,
     ModelVerdict,
     Reason,
-    of_each,
     of_model,
 )
 from sfm_shapefit.judgement.resolutions import recognize_resolution
@@ -66,8 +66,6 @@ if TYPE_CHECKING:
 
     from sfm_shapefit.report.drawing import Drawing
 
-_FEWEST_POINTS = 30  # points; an image that sees fewer is weak
-_LARGE_PX, _LARGE_OF_USUAL = 0.75, 2.0  # pixels and usual errors; an image whose error is above both is weak
 _ROUNDING = 1e-9  # share of the largest coordinate; cameras no farther apart stand at the same place
 
 
@@ -122,56 +120,160 @@ class OtherModel(NamedTuple):
     """Which of these it is."""
 
 
+_LATER: Any = None
+"""In place of what a later stage finds out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CheckState:
+    """A model as it stands between two stages of its check, which replace what they find out."""
+
+    model: ColmapModel
+    source: MatchSource
+    options: DirectionOptions
+    other: OtherModel | None = None
+    structure: Structure = _LATER
+    """The points of the model, or those that the matches of its pictures make."""
+    quality: ImageQuality = _LATER
+    fits: PairFits | None = None
+    """How pairs fit; None if no pair has a match."""
+    evidence: ModelEvidence = _LATER
+    weak: tuple[Reason, ...] = ()
+    """What is weak about how points hold images."""
+    reasons: tuple[Reason, ...] = ()
+    """What speaks against the model."""
+    verdict: ModelVerdict = _LATER
+
+    @property
+    def images(self) -> Images:
+        """The images of the model."""
+        return self.model.images
+
+
 def check_source(
     model: ColmapModel,
-    matches: MatchSource,
+    source: MatchSource,
     options: DirectionOptions,
     clock: Clock,
     other: OtherModel | None = None,
 ) -> CheckResult:
-    """Judge a model whose matches are open: measure, judge and grade it; another is a second opinion."""
-    with clock("points"):
-        pictures = ModelPictures(model.images, points2d_of(model.arrays, model.images))
-        structure = Structure(points_of(model.arrays, model.images), model.images, pictures)
-        quality = image_quality(*structure[:3])
-    fits = None
-    with clock("directions"), suppress(UnsolvableError):  # no pair may share matches
-        fits = fit_pairs(model.images.centers, measure(matches, options, clock).directions)
-        if matches.inputs.is_made:
-            structure = points_of_pictures(matches, fits)
-    pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
+    """Judge a model whose matches are open, by the stages of the module's header."""
+    state = CheckState(model=model, source=source, options=options, other=other)
+    state = read_structure(state, clock)
+    state = fit_directions(state, clock)
     with clock("evidence"):
-        evidence = gather_evidence(matches, fits, structure, clock.threads)
-        if matches.inputs.is_made or not matches.has_database:  # nothing else measured lenses
-            tracks = collect_tracks(model.images, structure.pictures, structure.points)
-            rows = np.arange(model.images.num_images)
-            evidence = replace(evidence, shape=ask_shape(model.images, rows, tracks))
-        weak = list(_find_weak(model.images, quality))
-        second = None if fits is None or other is None else _compare(matches, fits, structure, other)
-        if fits is not None and second is not None:
-            evidence = evidence.beside(second, fits.sides[1])
-    reasons = list(_reasons(model, structure, weak, fits, evidence, matches))
+        state = compare_with_other(gather_evidence_against(state, clock))
+    return finish_check(grade_model(state, clock), clock)
+
+
+def read_structure(state: CheckState, clock: Clock) -> CheckState:
+    """Read the points of a model, and how well they hold each image."""
+    with clock("points"):
+        arrays, images = state.model.arrays, state.images
+        pictures = ModelPictures(images, points2d_of(arrays, images))
+        structure = Structure(points_of(arrays, images), images, pictures)
+        quality = image_quality(*structure[:3])
+        weak = tuple(find_weak_images(images, quality))
+        return replace(state, structure=structure, quality=quality, weak=weak)
+
+
+def fit_directions(state: CheckState, clock: Clock) -> CheckState:
+    """Measure the directions of pairs, and compare them with where the cameras stand."""
+    source, fits, structure = state.source, None, state.structure
+    with clock("directions"), suppress(UnsolvableError):  # no pair may share matches
+        fits = fit_pairs(state.images.centers, measure(source, state.options, clock).directions)
+        if source.inputs.is_made:
+            structure = points_of_pictures(source, fits)
+    return replace(state, fits=fits, structure=structure)
+
+
+def gather_evidence_against(state: CheckState, clock: Clock) -> CheckState:
+    """Gather the evidence as `locate` does, with the open shape where nothing else has measured lenses."""
+    source, structure = state.source, state.structure
+    evidence = gather_evidence(source, state.fits, structure, clock.threads)
+    if source.inputs.is_made or not source.has_database:
+        tracks = collect_tracks(state.images, structure.pictures, structure.points)
+        rows = np.arange(state.images.num_images)
+        evidence = replace(evidence, shape=ask_shape(state.images, rows, tracks))
+    return replace(state, evidence=evidence)
+
+
+def compare_with_other(state: CheckState) -> CheckState:
+    """Add to the evidence how the other model compares, if there is one.
+
+    A single camera that stands elsewhere there does not count if the pixels confirm it here.
+    """
+    fits, other, images = state.fits, state.other, state.structure.images
+    if fits is None or other is None:
+        return state
+    second = compare_models(images, fits, other.images, other.fits, other.doubted)
+    if second is None:
+        return state
+    grade = other.source.models[other.number].located.verdict.grade
+    second = second._replace(grade=grade, folder=str(other.number))
+    elsewhere = [*second.wrong, *second.undecided]
+    if len(elsewhere) == 1:  # several that are wrong together see false points together
+        doubted = np.isin(np.arange(images.num_images), elsewhere)
+        if ask_pixels(state.source, state.structure, doubted).any():
+            second = second._replace(wrong=second.wrong[:0], undecided=second.undecided[:0])
+    return replace(state, evidence=state.evidence.beside(second, fits.sides[1]))
+
+
+def grade_model(state: CheckState, clock: Clock) -> CheckState:
+    """Weigh what speaks against the model; an input in another convention or resolution explains the rest."""
+    reasons, source = tuple(_reasons(state)), state.source
     verdict = ModelVerdict.weigh(reasons)
-    if verdict.is_bad and (far := matches.inputs.far):
-        near = check_source(model, matches.without(far), options, clock.anew()).verdict
+    if verdict.is_bad and (far := source.inputs.far):
+        near = check_source(state.model, source.without(far), state.options, clock.anew()).verdict
         verdict = verdict if near.is_bad else ModelVerdict.weigh(_of_alike_pictures(verdict.findings))
-    recognized = recognize_resolution(*structure[:3])
+    recognized = recognize_resolution(*state.structure[:3])
     if verdict.is_bad and recognized is None:
-        recognized = ask_convention(matches, clock.threads)
+        recognized = ask_convention(source, clock.threads)
     verdict = verdict.led_by(recognized and of_model(Kind.INPUT, recognized.sentence))
-    more = (one for one in reasons if one.of_each and one not in weak and one.kind is not Kind.SECOND_OPINION)
-    cameras = _tell_cameras(model, pairs, [*weak, *more])
-    told = tell_evidence(evidence, model.images)
-    facts = _tell(model, matches, cameras, pairs, quality)
-    facts |= {"verdict": verdict, "residual_level_deg": level_deg, "timings_s": clock.seconds}
-    facts |= {"evidence": told, "warnings": [*model.notes, *matches.matches.notes, *told.statements]}
+    return replace(state, reasons=reasons, verdict=verdict)
+
+
+def finish_check(state: CheckState, clock: Clock) -> CheckResult:
+    """Return the result: tables of cameras and pairs, and the figures."""
+    model, source, fits, quality = state.model, state.source, state.fits, state.quality
+    pairs = [] if fits is None else _pair_rows(state.images, fits)
+    named = [one for one in state.reasons if one.of_each and one.kind is not Kind.SECOND_OPINION]
+    cameras = _camera_rows(model, pairs, [*state.weak, *(one for one in named if one not in state.weak)])
+    told = tell_evidence(state.evidence, state.images)
+    error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
+    errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
+    facts = CheckedFacts(
+        inputs=source.inputs.facts,
+        images=str(source.inputs.images) if source.inputs.images else None,
+        options={},
+        verdict=state.verdict,
+        num_images=len(cameras),
+        num_placed=state.images.num_images,
+        num_pairs=len(pairs),
+        num_points=model.num_points,
+        figures=KeyFigures.of_cameras(
+            cameras, error_deg, float(np.median(state.images.focal_lengths_px)), "of the model's units"
+        ),
+        sigma_of="",
+        scale="input: those of the model",
+        pieces=[],
+        loose_groups=[],
+        versions={"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
+        mean_reprojection_error_px=float(errors_px.mean()) if len(errors_px) else np.nan,
+        num_lenses=len(np.unique(state.images.lens_of)),
+        median_track_length=_median(quality.point_track_lengths.tolist()),
+        residual_level_deg=np.nan if fits is None else fits.level_deg,
+        timings_s=clock.seconds,
+        evidence=told,
+        warnings=[*model.notes, *source.matches.notes, *told.statements],
+    )
     return CheckResult(
         model=model,
         cameras=cameras,
         pairs=pairs,
         quality=quality,
-        facts=CheckedFacts(**facts),
-        second_opinion=other and other.source,
+        facts=facts,
+        second_opinion=state.other and state.other.source,
     )
 
 
@@ -184,24 +286,7 @@ def _of_alike_pictures(findings: Iterable[Reason]) -> Iterator[Reason]:
     yield from (replace(one, grade=min(one.grade, Grade.LOOK, key=list(Grade).index)) for one in findings)
 
 
-def _compare(
-    matches: MatchSource, fits: PairFits, structure: Structure, other: OtherModel
-) -> SecondOpinion | None:
-    """Return how another model compares; a single camera elsewhere is not, if the pixels confirm it here."""
-    images = structure.images
-    second = compare_models(images, fits, other.images, other.fits, other.doubted)
-    if second is None:
-        return None
-    grade = other.source.models[other.number].located.verdict.grade
-    second = second._replace(grade=grade, folder=str(other.number))
-    elsewhere = [*second.wrong, *second.undecided]
-    if len(elsewhere) != 1:  # several that are wrong together see false points together
-        return second
-    sure = ask_pixels(matches, structure, np.isin(np.arange(images.num_images), elsewhere))
-    return second._replace(wrong=second.wrong[:0], undecided=second.undecided[:0]) if sure.any() else second
-
-
-def _tell_pairs(images: Images, fits: PairFits) -> list[PairRow]:
+def _pair_rows(images: Images, fits: PairFits) -> list[PairRow]:
     """Return a row per pair."""
     rows, directions = [], fits.directions
     for e, status in enumerate(directions.status):
@@ -221,7 +306,7 @@ def _tell_pairs(images: Images, fits: PairFits) -> list[PairRow]:
     return rows
 
 
-def _tell_cameras(model: ColmapModel, pairs: list[PairRow], weak: list[Reason]) -> list[CameraRow]:
+def _camera_rows(model: ColmapModel, pairs: list[PairRow], weak: list[Reason]) -> list[CameraRow]:
     """Return a row per image, those with a pose first."""
     names = model.images.names
     degrees = Counter(name for pair in pairs if pair.direction for name in (pair.name1, pair.name2))
@@ -240,31 +325,10 @@ def _tell_cameras(model: ColmapModel, pairs: list[PairRow], weak: list[Reason]) 
     return rows + [CameraRow(name=name, reason="it has no pose in the model") for name in sorted(others)]
 
 
-def _find_weak(images: Images, quality: ImageQuality) -> Iterator[Reason]:
-    """Yield what is weak about how points hold each image; a frame is held by one of its images."""
-    usual_px = _median(quality.errors_px[np.isfinite(quality.errors_px)].tolist())
-    num_points = np.zeros(len(images.frames.ids))
-    np.maximum.at(num_points, images.frame_of, quality.num_points)
-    has_points = len(quality.point_errors_px) > 0  # a lack of all is said of the whole model
-    for k, frame in enumerate(images.frame_of.tolist()):
-        if has_points and num_points[frame] < _FEWEST_POINTS:
-            seen = f"only {quality.num_points[k]}" if quality.num_points[k] else "no"
-            yield from of_each(Kind.POINTS, images.names[k : k + 1], f"it sees {seen} 3D points")
-        if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual_px):
-            error_px = quality.errors_px[k]
-            clause = f"its reprojection error is {error_px:.1f} px, where {usual_px:.1f} px is usual"
-            yield from of_each(Kind.POINTS, images.names[k : k + 1], clause)
-
-
-def _reasons(
-    model: ColmapModel,
-    structure: Structure,
-    weak: list[Reason],
-    fits: PairFits | None,
-    evidence: ModelEvidence,
-    matches: MatchSource,
-) -> Iterator[Reason]:
+def _reasons(state: CheckState) -> Iterator[Reason]:
     """Yield what speaks against a model; a weak camera that stands where another model has it is right."""
+    model, structure, source = state.model, state.structure, state.source
+    fits, evidence = state.fits, state.evidence
     pointless = not (model.num_points or structure.points.num_points)
     centers = model.images.centers
     if np.ptp(centers, axis=0).max() <= _ROUNDING * np.abs(centers).max():
@@ -272,7 +336,7 @@ def _reasons(
         yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
         return
     if fits is None or not (fits.contradicts.any() or np.isfinite(fits.residuals_deg).any()):
-        is_bare = pointless and not matches.inputs.database
+        is_bare = pointless and not source.inputs.database
         clause = "no two of its images have matches that say how they stand to each other"
         clause = "it has no 3D points, and no database was given or found" if is_bare else clause
         yield of_model(Kind.UNCHECKED, clause, Grade.CANNOT_BE_JUDGED)
@@ -280,56 +344,25 @@ def _reasons(
     against = list(weigh_evidence(evidence, model.images))
     yield from against
     if fits is not None and not any(one.grade is Grade.DO_NOT_USE for one in against):
-        yield from _none_agrees(fits, matches)
+        yield from _none_agrees(fits, source)
     confirmed = [] if evidence.second is None else evidence.second.confirmed.tolist()
     right = {model.images.names[k] for k in confirmed}
-    yield from (one for one in weak if not right.issuperset(one.images))
+    yield from (one for one in state.weak if not right.issuperset(one.images))
     if pointless:
         clause = "it has no 3D points, so that only matches say where its cameras stand"
         yield of_model(Kind.POINTS, clause)
-    if num_missing := len(matches.matches.missing_names):
+    if num_missing := len(source.matches.missing_names):
         clause = f"the database lacks {counted(num_missing, 'image')}: {IS_ITS_DATABASE}"
         yield of_model(Kind.INPUT, clause)
 
 
-def _none_agrees(fits: PairFits, matches: MatchSource) -> Iterator[Reason]:
+def _none_agrees(fits: PairFits, source: MatchSource) -> Iterator[Reason]:
     """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
     if (against := int(fits.contradicts.sum())) and not fits.agrees.any():
-        whose = ARE_ITS_PICTURES if matches.inputs.is_made else IS_ITS_DATABASE
-        asked = f": {whose}" * (matches.inputs.database is not None)
+        whose = ARE_ITS_PICTURES if source.inputs.is_made else IS_ITS_DATABASE
+        asked = f": {whose}" * (source.inputs.database is not None)
         pairs = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
         yield of_model(Kind.INPUT, f"{pairs} and none agrees{asked}", Grade.DO_NOT_USE)
-
-
-def _tell(
-    model: ColmapModel,
-    matches: MatchSource,
-    cameras: list[CameraRow],
-    pairs: list[PairRow],
-    quality: ImageQuality,
-) -> dict[str, Any]:
-    """Return what is told of a model beside its verdict, by the fields of `CheckedFacts`."""
-    error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
-    measures = (float(np.median(model.images.focal_lengths_px)), "of the model's units")
-    errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
-    return {
-        "inputs": matches.inputs.facts,
-        "images": matches.inputs.images and str(matches.inputs.images),
-        "options": {},
-        "num_images": len(cameras),
-        "num_placed": model.images.num_images,
-        "num_pairs": len(pairs),
-        "num_points": model.num_points,
-        "figures": KeyFigures.of_cameras(cameras, error_deg, *measures),
-        "sigma_of": "",
-        "scale": "input: those of the model",
-        "pieces": [],
-        "loose_groups": [],
-        "versions": {"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
-        "mean_reprojection_error_px": float(errors_px.mean()) if len(errors_px) else np.nan,
-        "num_lenses": len(np.unique(model.images.lens_of)),
-        "median_track_length": _median(quality.point_track_lengths.tolist()),
-    }
 
 
 def _median(values: list[float]) -> float:
