@@ -1,18 +1,21 @@
 """`check MODEL`: the verdict on a COLMAP model as it stands, with a second opinion of our own."""
 
-from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
+from sfm_shapefit.facts.checked_pieces import (
+    CheckedPiece,
+    CheckedPieces,
+    choose_kept,
+    compare_lenses,
+    focal_widths,
+    shared_images,
+)
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database
@@ -21,8 +24,6 @@ from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.model_folder import model_folders
 from sfm_shapefit.judgement.evidence import fit_pairs
-from sfm_shapefit.judgement.limits import FEW, HALF
-from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.map import map_database, map_opened
@@ -30,7 +31,6 @@ from sfm_shapefit.pipeline.pictures import AskedPictures, match_pictures
 from sfm_shapefit.pipeline.referee import CheckResult, OtherModel, check_source
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
-from sfm_shapefit.scene.sequences import find_sequences
 
 
 def check(
@@ -148,52 +148,13 @@ def check_pieces(
             pieces.append(CheckedPiece(folder=name, error=str(error)))
             continue
         images[name] = found.model.images
-        widths = _focal_widths(images[name])
+        widths = focal_widths(images[name])
         lenses = (float(widths.min()), float(widths.max()))
         pieces.append(CheckedPiece(folder=name, focal_widths=lenses, facts=found.facts))
     if not images:
         raise InputError(f"{folder} holds no COLMAP model that can be read; {pieces[0].error}")
-    keep = set(_choose(pieces, images))
+    keep = set(choose_kept(pieces, images))
     pieces = [replace(one, keep=one.folder in keep) for one in pieces]
-    return CheckedPieces(pieces=tuple(pieces), contradictions=(*_compare_lenses(images), *_shared(images)))
-
-
-def _focal_widths(images: Images) -> FloatArray:
-    """Return the focal length of each image over the longer side of its picture, (i,)."""
-    return np.asarray(images.focal_lengths_px / images.sizes_px.max(axis=1))
-
-
-def _choose(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -> Iterator[str]:
-    """Yield the folders of the models to keep."""
-    usable = [p for p in pieces if p.facts and p.facts.verdict.grade in (Grade.GOOD, Grade.LOOK)]
-    taken = set[str]()
-    for one in sorted(usable, key=lambda one: -images[one.folder].num_images):
-        names = set(images[one.folder].names)
-        if len(names - taken) >= HALF * len(names):
-            taken |= names
-            yield one.folder
-
-
-def _compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
-    """Yield where models disagree on the focal length of one device."""
-    names = [name for one in images.values() for name in one.names]
-    widths = np.concatenate([_focal_widths(one) for one in images.values()])
-    model = np.repeat(np.arange(len(images)), [one.num_images for one in images.values()])
-    for rows, _ in find_sequences(names):
-        there = np.unique(model[rows])
-        typical = np.array([np.median(widths[rows][model[rows] == k]) for k in there])
-        if np.ptp(np.log(typical)) > FEW:
-            least, most = (Path([*images][there[k]]).name for k in (typical.argmin(), typical.argmax()))
-            yield (
-                f"one device, as {names[rows[0]]} and others say, has a focal length of {typical.min():.3g} "
-                f"picture widths in {least} and of {typical.max():.3g} in {most}: give its images one camera "
-                "(--ImageReader.single_camera 1), and reconstruct again"
-            )
-
-
-def _shared(images: Mapping[str, Images]) -> Iterator[str]:
-    """Yield which models have images in common."""
-    for (one, mine), (other, others) in combinations(images.items(), 2):
-        if common := len(set(mine.names) & set(others.names)):
-            both = f"{Path(one).name} and {Path(other).name} have {counted(common, 'image')} in common"
-            yield f"{both}; sfm-shapefit join puts them into one world"
+    return CheckedPieces(
+        pieces=tuple(pieces), contradictions=(*compare_lenses(images), *shared_images(images))
+    )
