@@ -197,7 +197,6 @@ def nerf_text(images: Images, points_file: str = "") -> str:
 
 
 def _intrinsics(lens: Lens) -> dict[str, Any]:
-    """Return a lens's keys."""
     if lens.is_panorama:
         width, height = lens.parameters
         values = (0.5 * width, height, 0.5 * width, 0.5 * height)

@@ -108,7 +108,6 @@ def poses_csv(images: Images) -> str:
 
 
 def _timestamps(names: tuple[str, ...]) -> list[str]:
-    """Return the timestamp of each image, as text."""
     if len({number_of(name) for name in names} - {None}) == len(names):
         return [NUMBER.findall(stem_of(name))[0] for name in names]
     position = {name: k for k, name in enumerate(sorted(names))}

@@ -87,9 +87,11 @@ def bundle_adjust(
     images, points, tracks = read_bundle(read)
     has_ray = np.isfinite(tracks.on_plane).all(axis=1)
     seen = np.where(has_ray, points.points_seen(), -1)
-    found = TriangulatedPoints(points=points.xyz, tracks=np.arange(points.num_points), points_seen=seen)
+    triangulated = TriangulatedPoints(
+        points=points.xyz, tracks=np.arange(points.num_points), points_seen=seen
+    )
     views, given = views_of(images), GivenPoses(fixed=np.isin(images.frames.ids, sorted(fixed_frames)))
-    problem = views.problem(images, np.zeros(len(images.lenses), np.bool_), given, tracks, found)
+    problem = views.problem(images, np.zeros(len(images.lenses), np.bool_), given, tracks, triangulated)
     if rotation_sigma_deg is not None:
         sigmas = np.full(problem.num_frames, np.radians(rotation_sigma_deg))
         prior = RotationPrior(rotations=problem.rotations, information=isotropic_information(sigmas))

@@ -105,14 +105,14 @@ def with_uncertainty(placement: Judged, images: Images, known: Estimate, scale: 
     """Return the placement with what an adjustment knows of its errors, `scale` to the solver's unit."""
     if known.covariances is None:
         return placement
-    own = np.full((len(placement.cameras), 3, 3), np.nan)
-    _, rows, there = np.intersect1d(
+    covariances = np.full((len(placement.cameras), 3, 3), np.nan)
+    _, rows, known_rows = np.intersect1d(
         images.ids[placement.cameras], known.images.ids, assume_unique=True, return_indices=True
     )
-    own[rows] = known.covariances[there] / scale**2
+    covariances[rows] = known.covariances[known_rows] / scale**2
     return replace(
         placement,
-        adjusted_covariances=own,
+        adjusted_covariances=covariances,
         lens_errors=known.lens_errors,
         scale_sigma=placement.scale_sigma if known.scale_sigma is None else known.scale_sigma,
     )
@@ -120,7 +120,7 @@ def with_uncertainty(placement: Judged, images: Images, known: Estimate, scale: 
 
 def _measure_again(
     source: MatchSource,
-    before: PairDirections,
+    earlier: PairDirections,
     corrected: BoolArray,
     options: DirectionOptions,
     clock: Clock,
@@ -129,18 +129,18 @@ def _measure_again(
 
     Images whose rotations were clearly wrong, and are `corrected`, get what their matches say now.
     """
-    usable = before.usable()
-    used = before.pairs[usable]
+    usable = earlier.usable()
+    used = earlier.pairs[usable]
     others = source.view.pairs[~is_among(source.view.pairs, used)]
     batches = source.view.batches(without=others, advance=clock.advance)
     again = concatenate([estimate_directions(batch, options, clock.threads) for batch in batches])
     rows = again.usable()
     is_anew = corrected[again.pairs[rows]].any(axis=1)
     taken = {"directions": rows, **dict.fromkeys(_SAID_OF_MATCHES, rows[is_anew])}
-    merged = {name: getattr(before, name).copy() for name in taken}
+    merged = {name: getattr(earlier, name).copy() for name in taken}
     for name, chosen in taken.items():
         merged[name][usable[chosen]] = getattr(again, name)[chosen]
-    return replace(before, **merged)
+    return replace(earlier, **merged)
 
 
 def _turn(measured: MeasuredGraph, directions: PairDirections, turns: FloatArray) -> MeasuredGraph:

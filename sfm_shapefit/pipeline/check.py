@@ -65,14 +65,14 @@ def check(
     clock = Clock.of(progress)
     with clock("read"):
         inputs = choose_inputs(model, database)
-        asked = None
+        request = None
         if images is not None and inputs.database is None and max_minutes != 0.0:
-            asked = AskedPictures(folder=Path(images), max_minutes=max_minutes)
-        posed = read_by_itself(model, with_lenses=True) if asked else read_source(model, database)[0]
+            request = AskedPictures(folder=Path(images), max_minutes=max_minutes)
+        posed = read_by_itself(model, with_lenses=True) if request else read_source(model, database)[0]
     other = None
     with ExitStack() as stack:
-        if asked is not None:
-            inputs = replace(stack.enter_context(match_pictures(posed, asked, clock)), folder=inputs.folder)
+        if request is not None:
+            inputs = replace(stack.enter_context(match_pictures(posed, request, clock)), folder=inputs.folder)
         source = stack.enter_context(open_source(posed, inputs))
         if second_opinion and isinstance(source.matches, DatabaseMatches):
             file = source.matches.file
@@ -87,22 +87,22 @@ def check(
 
 
 def _map_anew(
-    file: DatabaseFile, posed: ColmapModel, found: bool | MapResult, clock: Clock
+    file: DatabaseFile, posed: ColmapModel, mapped: bool | MapResult, clock: Clock
 ) -> OtherModel | None:
     """Return the model of the database that has most images in common; None if nothing can be placed."""
-    if not isinstance(found, MapResult):
+    if not isinstance(mapped, MapResult):
         try:
-            found = map_opened(file, MapOptions(), clock)
+            mapped = map_opened(file, MapOptions(), clock)
         except UnsolvableError:
             return None
-    models = [model.located for model in found.models]
+    models = [model.located for model in mapped.models]
     number = max(range(len(models)), key=lambda k: _num_common(posed.images, models[k].placed))
     best = models[number]
     doubted = np.zeros(best.placed.num_images, dtype=np.bool_)
     doubted[best.placement.cameras] = best.placement.assessment.ambiguous
     doubted[[place.camera for place in best.evidence.places]] = True
     fits = fit_pairs(best.placed.centers, best.directions)
-    return OtherModel(best.placed, fits, doubted, found, number)
+    return OtherModel(best.placed, fits, doubted, mapped, number)
 
 
 def _num_common(images: Images, others: Images) -> int:
@@ -143,14 +143,14 @@ def check_pieces(
     for path in models:
         name = str(path)
         try:
-            found = check(path, database, second_opinion=second_opinion, progress=progress)
+            checked = check(path, database, second_opinion=second_opinion, progress=progress)
         except InputError as error:
             pieces.append(CheckedPiece(folder=name, error=str(error)))
             continue
-        images[name] = found.model.images
+        images[name] = checked.model.images
         widths = focal_widths(images[name])
         lenses = (float(widths.min()), float(widths.max()))
-        pieces.append(CheckedPiece(folder=name, focal_widths=lenses, facts=found.facts))
+        pieces.append(CheckedPiece(folder=name, focal_widths=lenses, facts=checked.facts))
     if not images:
         raise InputError(f"{folder} holds no COLMAP model that can be read; {pieces[0].error}")
     keep = set(choose_kept(pieces, images))

@@ -117,10 +117,10 @@ class MapContext(NamedTuple):
 
     def find_videos(self, relative: RelativeRotations) -> Videos:
         """Return the videos among the images, as far as the options want to know of them."""
-        asked = self.options.averaging.sequence
+        sequence = self.options.averaging.sequence
         nothing = Videos(np.full(self.images.num_images, -1), np.full(self.images.num_images, -1))
-        videos = nothing if asked == "none" else find_videos(self.images.names)
-        return confirm_videos(videos, relative) if asked == "auto" else videos
+        videos = nothing if sequence == "none" else find_videos(self.images.names)
+        return confirm_videos(videos, relative) if sequence == "auto" else videos
 
     def judge_loops(
         self, videos: Videos, relative: RelativeRotations
@@ -146,7 +146,7 @@ class MapContext(NamedTuple):
                 pixels = [view.keypoints(k) for k in range(self.images.num_images)]
                 sizes = self.images.sizes_px
                 batches = list(view.links(LEAST_MATCHES))  # both look at all of them
-                partners = count_partners([len(own) for own in pixels], batches)
+                partners = count_partners([len(image_pixels) for image_pixels in pixels], batches)
                 for batch in batches:
                     rows = rows_of_pairs(batch.pairs, relative.pairs)
                     scores[rows[rows >= 0], 1] = matched_shares(pixels, sizes, partners, batch)[rows >= 0]

@@ -122,14 +122,14 @@ def write_converted(
     notes = model.notes
     centers = model.images.centers
     world = world_of(model_datum(given) if coordinates[0] else None, centers, *coordinates)
-    told = world.statement
+    statement = world.statement
     if not (world.is_own or FORMATS[name].is_exact):
         model = read_model(transform_model(model.reconstruction, world.similarity(centers)))
-        told += world.bend_statement(centers)
-    told = "; ".join(filter(None, [told, *notes]))
+        statement += world.bend_statement(centers)
+    statement = "; ".join(filter(None, [statement, *notes]))
     if name in _FOLDERS:
         _write_folder(model, path, name, world, protect)
-        return Converted(name, (path,), told)
+        return Converted(name, (path,), statement)
     contents = _contents(name, _Scene(source, model, world, trust, path.stem))
     files = {
         path.with_name(path.stem + (tail if "." in tail else tail + path.suffix)): one
@@ -142,12 +142,10 @@ def write_converted(
     with ExitStack() as whole:  # all are written before the first is in its place
         for file, content in files.items():
             whole.enter_context(atomic_file(file)).write_bytes(content)
-    return Converted(name, tuple(files), told)
+    return Converted(name, tuple(files), statement)
 
 
 class _Scene(NamedTuple):
-    """What is written of a model."""
-
     source: "ModelSource"
     model: "ColmapModel"
     world: "World"
@@ -194,7 +192,6 @@ def _points_and_cameras(scene: _Scene) -> dict[str, bytes]:
 
 
 def _with_points(scene: _Scene) -> dict[str, bytes]:
-    """Return a transforms.json and the points that it names."""
     from sfm_shapefit.files.colmap.seed import pick_points
     from sfm_shapefit.files.nerf import nerf_text
     from sfm_shapefit.report.mesh import ply_bytes
@@ -205,21 +202,21 @@ def _with_points(scene: _Scene) -> dict[str, bytes]:
 
 
 def _covariances(scene: _Scene) -> str:
-    """Return the covariances of an output as a table."""
     from sfm_shapefit.facts.rows import covariances_text, read_covariances
 
     if not isinstance(scene.source, Path | str):
         raise InputError("covariances are those of the folder that locate or map wrote; give that")
     images = scene.model.images
-    found = read_covariances(Path(scene.source) / "covariances.csv")
+    covariances = read_covariances(Path(scene.source) / "covariances.csv")
     slopes = dict(zip(images.names, scene.world.slopes(images.centers), strict=True))
-    return covariances_text({k: slopes[k] @ one @ slopes[k].T for k, one in found.items() if k in slopes})
+    return covariances_text(
+        {k: slopes[k] @ one @ slopes[k].T for k, one in covariances.items() if k in slopes}
+    )
 
 
 def _write_folder(
     model: "ColmapModel", path: Path, name: str, world: "World", protect: Sequence[Path | str]
 ) -> None:
-    """Write a model as COLMAP has it, and the offset of its coordinates beside it."""
     from sfm_shapefit.files.colmap.seed import write_model
 
     if path.is_dir() and any(path.iterdir()):

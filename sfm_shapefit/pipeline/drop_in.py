@@ -63,12 +63,12 @@ def global_mapping(
 def _options_of(theirs: "pycolmap.GlobalPipelineOptions") -> MapOptions:
     """Return the options of pycolmap that have a counterpart, where they are not its defaults."""
     usual = type(theirs)()
-    told = {
+    values = {
         ours: getattr(theirs, name)
         for name, ours in _TAKEN.items()
         if getattr(theirs, name, None) != getattr(usual, name, None)
     }
-    return MapOptions(**told)
+    return MapOptions(**values)
 
 
 def average_database(

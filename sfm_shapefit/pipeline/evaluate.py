@@ -47,8 +47,8 @@ def evaluate(
         poses = poses._replace(names=named_as(Path(reconstruction), poses.names, truth.names))
     elif isinstance(reference, Path | str) and is_list(reference):
         truth = truth._replace(names=named_as(Path(reference), truth.names, poses.names))
-    found = evaluate_poses(poses, truth, thresholds, trajectory=trajectory)
-    return replace(found, warnings=(*read[0].notes, *read[1].notes, *found.warnings))
+    evaluation = evaluate_poses(poses, truth, thresholds, trajectory=trajectory)
+    return replace(evaluation, warnings=(*read[0].notes, *read[1].notes, *evaluation.warnings))
 
 
 def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEvaluation:

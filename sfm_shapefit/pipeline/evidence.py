@@ -65,14 +65,16 @@ def gather_evidence(
     asked_of = [one.camera for one in contradicted]
     asked_of += [] if source.has_database else [one.camera for one in places]
     doubted = np.isin(np.arange(images.num_images), asked_of)
-    sure = ask_pixels(source, structure, doubted)  # own tracks hold no second place of who fits the first
+    confirmed = ask_pixels(
+        source, structure, doubted
+    )  # own tracks hold no second place of who fits the first
     num_unasked = int(np.sum(source.view.num_keypoints == 0)) if source.inputs.is_made else 0
     return ModelEvidence(
         lenses=lenses,
         oddities=odd,
-        places=tuple(one for one in places if source.has_database or not sure[one.camera]),
+        places=tuple(one for one in places if source.has_database or not confirmed[one.camera]),
         seams=seams,
-        contradicted=tuple(one for one in contradicted if not sure[one.camera]),
+        contradicted=tuple(one for one in contradicted if not confirmed[one.camera]),
         untied=tuple(one for one in untied if 2 * np.isin(one.cameras, apart).sum() < len(one.cameras)),
         num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)) + num_unasked,
         sides=(int(fits.agrees.sum()), int(fits.contradicts.sum())),
@@ -112,10 +114,10 @@ def confirm_by_pixels(state: ModelState) -> BoolArray:
 
 def with_left_out(state: ModelState) -> Images:
     """Return the delivered images, and where they are placed those that were left out."""
-    before, now = state.placed().frames.centers, state.images.frames.centers
-    there = np.isfinite(before).all(axis=1) & np.isfinite(now).all(axis=1)
-    motion = fit_similarity(before[there], now[there])
-    placed = np.where(np.isfinite(now), now, motion.apply(before))
+    placed_centers, now = state.placed().frames.centers, state.images.frames.centers
+    common = np.isfinite(placed_centers).all(axis=1) & np.isfinite(now).all(axis=1)
+    motion = fit_similarity(placed_centers[common], now[common])
+    placed = np.where(np.isfinite(now), now, motion.apply(placed_centers))
     return state.images.posed(state.images.frames.rotations, placed)
 
 
@@ -154,15 +156,15 @@ def ask_shape(
     if not isinstance(tracks, ObservedTracks) or len(rows) < SMALLEST_SHAPE:
         return None
     held = {"lenses_held": lenses_held, "rotations_held": rotations_held}
-    found = None if all(held.values()) else estimate_open_shape(images.part(rows), tracks, **held)
-    return None if found is None else OpenShape.of(images, rows, found)
+    shape = None if all(held.values()) else estimate_open_shape(images.part(rows), tracks, **held)
+    return None if shape is None else OpenShape.of(images, rows, shape)
 
 
 def open_beyond_noise(state: ModelState, shape: OpenShape) -> FloatArray:
     """Return the covariances (k, 3, 3) that a shape leaves open beyond its noise, in the solver's unit."""
     judged, scale = state.judged, state.gauge.similarity.scale
-    told = np.clip(judged.covariances, -_OPEN, _OPEN)  # a camera that hangs loose has huge ones
-    return excess(shape.covariances[judged.cameras] / scale**2, told)
+    known = np.clip(judged.covariances, -_OPEN, _OPEN)  # a camera that hangs loose has huge ones
+    return excess(shape.covariances[judged.cameras] / scale**2, known)
 
 
 def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:
@@ -240,7 +242,7 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
     hanging = find_hanging(len(group), rays, holding, together)
     groups = (*groups, *(one for one in hanging if not np.isin(one.cameras, named).any()))
     rows = (np.flatnonzero(np.isin(frames, one.cameras) & images.is_posed) for one in groups)
-    return of, tuple(one._replace(cameras=own) for one, own in zip(groups, rows, strict=True))
+    return of, tuple(one._replace(cameras=cameras) for one, cameras in zip(groups, rows, strict=True))
 
 
 def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray) -> BoolArray:
@@ -265,12 +267,12 @@ def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray
         same = (ends[:, 0] == ends[:, 1]) & fitting[keypoints].all(axis=1)
         apart = (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])
         rows = np.flatnonzero(apart)
-        for own in (0, 1):  # the point of either end, where the other has its keypoint
+        for end in (0, 1):  # the point of either end, where the other has its keypoint
             one = Points(
-                xyz=points.xyz[ends[rows, own]],
+                xyz=points.xyz[ends[rows, end]],
                 offsets=np.arange(len(rows) + 1),
-                images=seen_by[rows, 1 - own],
-                keypoints=batch.keypoints[rows, 1 - own],
+                images=seen_by[rows, 1 - end],
+                keypoints=batch.keypoints[rows, 1 - end],
                 ids=rows,
             )
             rows = rows[keypoint_errors_px(one, images, structure.pictures) <= FITTING_PX]

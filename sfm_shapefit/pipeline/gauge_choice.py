@@ -37,17 +37,17 @@ def bring_to_gauge(state: ModelState) -> ModelState:
     unit, is_fixed = None if state.placement.unit is None else 1.0, bool(state.inputs.fixed.any())
     if is_fixed and unit is not None:
         return state
-    given, own = state.source.images.rotations[cameras], images.rotations[cameras]
-    turn = np.eye(3) if is_fixed else mean_rotation_l1(given.transpose(0, 2, 1) @ own)
-    found = state.gauge_rule.choose(cameras, images.centers[cameras] @ turn.T, unit)
-    axes = np.eye(3) if found.axes is None else found.axes
-    scale, shift, before = found.similarity.scale, found.similarity.translation, frame.similarity
+    given, present = state.source.images.rotations[cameras], images.rotations[cameras]
+    turn = np.eye(3) if is_fixed else mean_rotation_l1(given.transpose(0, 2, 1) @ present)
+    chosen = state.gauge_rule.choose(cameras, images.centers[cameras] @ turn.T, unit)
+    axes = np.eye(3) if chosen.axes is None else chosen.axes
+    scale, shift, earlier = chosen.similarity.scale, chosen.similarity.translation, frame.similarity
     motion = Similarity(scale=scale, rotation=axes @ turn, translation=axes @ shift)
-    moved = scale * turn @ before.translation + shift
-    similarity = replace(before, scale=scale * before.scale, translation=moved)
+    moved = scale * turn @ earlier.translation + shift
+    similarity = replace(earlier, scale=scale * earlier.scale, translation=moved)
     _, mark, pulled = frame.statement.partition(PULLED)  # what pulled the cameras before
-    statement = f"{found.statement}{mark}{pulled}"
-    return state.moved(motion, replace(found, similarity=similarity, statement=statement))
+    statement = f"{chosen.statement}{mark}{pulled}"
+    return state.moved(motion, replace(chosen, similarity=similarity, statement=statement))
 
 
 def turn_about_origin(rotation: FloatArray) -> Similarity:
@@ -71,15 +71,14 @@ def bring_to_known(state: ModelState) -> ModelState:
 
 
 def _bring_to_control_points(state: ModelState, known: ControlPoints) -> ModelState:
-    """Return a model in the world of control points, with a row for each point."""
     moves, resize = not state.inputs.fixed.any(), state.placement.unit is None
     images, options = state.images, state.inputs.options.structure
-    found = triangulate_control_points(known, look_at_marks(images, known), options)
-    fit = fit_control_points(known, found.positions, resize=resize or not moves)
-    warnings = list(control_warnings(known, found, fit, images.names))
-    rows = control_rows(known, found, fit)
+    triangulated = triangulate_control_points(known, look_at_marks(images, known), options)
+    fit = fit_control_points(known, triangulated.positions, resize=resize or not moves)
+    warnings = list(control_warnings(known, triangulated, fit, images.names))
+    rows = control_rows(known, triangulated, fit)
     if not (isinstance(fit, str) or (moves and resize)):
-        free = fit_control_points(known, found.positions)
+        free = fit_control_points(known, triangulated.positions)
         scale = 1.0 if isinstance(free, str) else free.motion.scale
         warnings.append(say_unused("control points were", state.gauge, lambda: scale))
     if not (isinstance(fit, str) or moves):
@@ -95,15 +94,15 @@ def _turn_upright(state: ModelState, gravity: Gravity) -> ModelState:
     from sfm_shapefit.rotations.gravity import FEWEST_GRAVITIES, down_of, judge_gravity, turn_upright
 
     images, members = state.images, np.flatnonzero(state.images.is_posed)
-    rotations, own = images.rotations[members], gravity.of(members)
-    if len(own.indices) < FEWEST_GRAVITIES:
-        few = f"{len(own.indices)} of the placed images have a gravity, and two are needed"
+    rotations, known = images.rotations[members], gravity.of(members)
+    if len(known.indices) < FEWEST_GRAVITIES:
+        few = f"{len(known.indices)} of the placed images have a gravity, and two are needed"
         return state.warned(f"{few} to turn the model upright")
-    turn = turn_upright(down_of(rotations, own))
-    off, wrong = judge_gravity(rotations @ turn.T, own)
+    turn = turn_upright(down_of(rotations, known))
+    off, wrong = judge_gravity(rotations @ turn.T, known)
     if wrong.any():
         worst = np.flatnonzero(wrong)[np.argsort(-off[wrong], kind="stable")]
-        names = [images.names[members[own.indices[k]]] for k in worst[:_NAMED].tolist()]
+        names = [images.names[members[known.indices[k]]] for k in worst[:_NAMED].tolist()]
         state = state.warned(
             f"gravities of {len(worst)} of {len(wrong)} images contradict their rotations and have no part: "
             f"{', '.join(names)}, by up to {np.degrees(off[worst[0]]):.0f} deg"

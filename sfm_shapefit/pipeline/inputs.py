@@ -204,8 +204,8 @@ def choose_inputs(
         return Inputs(folder=folder, database=None, statement="the model's own tracks, as asked")
     # The pixels of other programs' model files may differ from those of a database beside them.
     is_folder = folder is not None and not folder.is_file()
-    found = find_database(folder) if folder is not None and is_folder else None
-    path = Path(database) if database is not None else found
+    nearby = find_database(folder) if folder is not None and is_folder else None
+    path = Path(database) if database is not None else nearby
     if path is None:
         if source != "auto":
             raise InputError(f"directions from {source} need a database; give one (database=FILE)")
@@ -246,10 +246,10 @@ def settle_intrinsics(
         lenses = [lens if lens.is_panorama else lens.in_doubt(Origin.CALIBRATION) for lens in lenses]
     for k in (k for k, lens in enumerate(images.lenses) if lens.id in listed):
         lenses[k] = images.lenses[k].in_doubt(Origin.GUESS)
-    for k, found in guessed.items():
-        lenses[k] = images.lenses[k].in_doubt(found.origin)
-    asked = [found.database_id for found in guessed.values()]
-    by_pairs = read_pair_focals(file, asked, left_out) if file is not None and asked else {}
+    for k, guess in guessed.items():
+        lenses[k] = images.lenses[k].in_doubt(guess.origin)
+    database_ids = [guess.database_id for guess in guessed.values()]
+    by_pairs = read_pair_focals(file, database_ids, left_out) if file is not None and database_ids else {}
     if file is not None and guessed and wanted != "held":
         doubted = np.isin(np.arange(len(lenses)), list(guessed))
         by_rays = doubted & [lens.is_adjustable and not lens.is_plane for lens in lenses]
@@ -277,38 +277,38 @@ def _by_view_graph(
     left_out: PairNames,
 ) -> FloatArray:
     """Return by which factor each lens (l,) is to be longer, 1 where no pair says."""
-    others = [found.database_id for k, found in guessed.items() if not by_rays[k]]
+    others = [guess.database_id for k, guess in guessed.items() if not by_rays[k]]
     by_database = calibrate_view_graph(file, others, left_out) if others else {}
     for i, one in by_pairs.items():
         known = by_database.get(i)
         if known is None or (one.is_one_sided and not 1.0 / _ALIKE < one.factor / known < _ALIKE):
             by_database[i] = one.factor
     factors = np.ones(len(by_rays))
-    for k, found in guessed.items():
-        factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
+    for k, guess in guessed.items():
+        factors[k] = by_database.get(guess.database_id, 1.0 / guess.ratio) * guess.ratio
     factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
     return factors
 
 
 def _contradicted_guesses(
-    before: Sequence[Lens],
+    as_read: Sequence[Lens],
     lenses: Sequence[Lens],
     guessed: Mapping[int, Uncalibrated],
     by_pairs: Mapping[int, PairFocal],
 ) -> Iterator[str]:
     """Yield which lenses start from another focal length than their pairs were verified with, if any do."""
-    told = []
-    for k, found in guessed.items():
-        if found.database_id not in by_pairs:
+    named = []
+    for k, guess in guessed.items():
+        if guess.database_id not in by_pairs:
             continue
-        one, focal_px = by_pairs[found.database_id], lenses[k].focal_px
-        asked_px = before[k].focal_px * one.factor * found.ratio
+        one, focal_px = by_pairs[guess.database_id], lenses[k].focal_px
+        asked_px = as_read[k].focal_px * one.factor * guess.ratio
         if not 1.0 / _UNLIKE < asked_px / focal_px < _UNLIKE:
-            told.append(
+            named.append(
                 f"{one.num_pairs} of camera {lenses[k].id} with {asked_px:,.0f} px, not {focal_px:,.0f}"
             )
-    if told:
+    if named:
         yield (
             "COLMAP verified pairs with other focal lengths than their guessed lenses start from: "
-            f"{first_of(told)}; intrinsics=auto lets these change"
+            f"{first_of(named)}; intrinsics=auto lets these change"
         )

@@ -89,9 +89,9 @@ def join(
         with clock("adjustment"):
             group = group._replace(reconstruction=bundle_adjust(group.reconstruction).reconstruction)
     notes = [f"{piece.label}: {note}" for piece in pieces for note in piece.model.notes]
-    told = JoinInputs(joins, flat_values(options), inputs, notes=notes)
+    join_inputs = JoinInputs(joins, flat_values(options), inputs, notes=notes)
     with open_source(read_model(group.reconstruction), inputs) as source:
-        return tell_group(group, told, source, options.directions, clock)
+        return tell_group(group, join_inputs, source, options.directions, clock)
 
 
 def _read(
@@ -99,13 +99,13 @@ def _read(
 ) -> list[ModelPiece]:
     """Read the models, and refuse those that have nothing to join."""
     pieces: list[ModelPiece] = []
-    found = [*map(read_model, models)]
-    every = {name for model in found for name in model.images.names}
+    read_models = [*map(read_model, models)]
+    every = {name for model in read_models for name in model.images.names}
     # A database that has all of them, each under its own name, says that they are different images.
     are_different = False
     with suppress(InputError):  # what is wrong with a database is said where it is opened for its matches
         are_different = database is not None and not _missing(database, every)
-    for number, (source, model) in enumerate(zip(models, found, strict=True)):
+    for number, (source, model) in enumerate(zip(models, read_models, strict=True)):
         label = str(source) if isinstance(source, Path | str) else f"model {number}"
         names = dict.fromkeys(name for piece in pieces for name in piece.model.images.names)
         piece = ModelPiece(label=label, model=model if are_different else renamed_as(model, list(names)))
@@ -126,7 +126,6 @@ def _read(
 
 
 def _missing(database: Path, names: Collection[str]) -> tuple[str, ...]:
-    """Return the names of images that a database lacks."""
     with closing(open_database(database, sorted(names))) as matches:
         return matches.missing_names
 
@@ -142,8 +141,8 @@ def _without_foreign(inputs: Inputs, names: Sequence[str]) -> Inputs:
         return replace(inputs, database=None, statement=f"{shared}; the database beside the first: {error}")
     if not missing:
         return inputs
-    told = f"{shared}; {path}, found beside the first, lacks {len(missing)} of {len(names)} images"
-    return replace(inputs, database=None, statement=told)
+    statement = f"{shared}; {path}, found beside the first, lacks {len(missing)} of {len(names)} images"
+    return replace(inputs, database=None, statement=statement)
 
 
 def _opened(pieces: Sequence[ModelPiece], database: Path, names: Sequence[str]) -> Any:

@@ -67,11 +67,11 @@ def judge_joins(
     pieces: Sequence[ModelPiece], tied: TiedPieces, priors: Sequence[PositionPriors | None] = ()
 ) -> Iterator[Joined]:
     """Yield what comes of joining each piece but the first: by pairs, or else by `priors` of its cameras."""
-    found = join_pieces(tied.cameras, tied.ties)
+    outcomes = join_pieces(tied.cameras, tied.ties)
     usable = [] if tied.cameras.is_metric.any() else priors
     placed = [_on_priors(tied.cameras.centers_of(k), one) for k, one in enumerate(usable)]
     for number in range(1, len(pieces)):
-        done = found[number]
+        done = outcomes[number]
         if placed and (not isinstance(done, PieceJoin) or done.reason):
             other = _join_by_priors(number, placed)
             done = other if isinstance(other, PieceJoin) or done == UNTIED else done
@@ -113,13 +113,13 @@ def _on_priors(centers: FloatArray, priors: PositionPriors | None) -> PlacedByPr
 
 def _join_by_priors(number: int, placed: Sequence[PlacedByPriors | str]) -> PieceJoin | str:
     """Return the join of a piece to the first of the earlier ones that priors allow, or why there is none."""
-    own, reasons = placed[number], list[str]()
+    piece, reasons = placed[number], list[str]()
     for to, other in enumerate(placed[:number]):
-        if isinstance(own, str) or isinstance(other, str):
-            reasons.append(own if isinstance(own, str) else str(other))
+        if isinstance(piece, str) or isinstance(other, str):
+            reasons.append(piece if isinstance(piece, str) else str(other))
             continue
         try:
-            return join_by_priors((to, other), (number, own))
+            return join_by_priors((to, other), (number, piece))
         except UnsolvableError as error:
             reasons.append(str(error))
     return next((reason for reason in reasons if reason != UNTIED), UNTIED)
@@ -189,58 +189,58 @@ def _fitting(tied: TiedPieces, pair: int, worlds: Mapping[int, Similarity]) -> t
     ties = tied.ties.matches
     rows = slice(*ties.offsets[pair : pair + 2].tolist())
     off, ends = np.zeros(rows.stop - rows.start), ties.pairs[pair].tolist()
-    own = [worlds[int(tied.cameras.piece_of[v])] for v in ends]
+    end_worlds = [worlds[int(tied.cameras.piece_of[v])] for v in ends]
     for way, rays in enumerate((ties.rays_i[rows], ties.rays_j[rows])):
-        seen = own[1 - way].apply(tied.ties.points[rows, 1 - way])
-        eye = own[way].apply(tied.cameras.centers[ends[way]][None])
-        looks = rays @ tied.cameras.rotations[ends[way]] @ own[way].rotation.T
+        seen = end_worlds[1 - way].apply(tied.ties.points[rows, 1 - way])
+        eye = end_worlds[way].apply(tied.cameras.centers[ends[way]][None])
+        looks = rays @ tied.cameras.rotations[ends[way]] @ end_worlds[way].rotation.T
         off = np.maximum(off, angle_between(seen - eye, looks))
     return rows, np.asarray(off <= AGREEING_PX * ties.pixel_angles[pair])
 
 
 def tell_group(
-    group: JoinedGroup, told: JoinInputs, source: MatchSource, options: DirectionOptions, clock: Clock
+    group: JoinedGroup, join_inputs: JoinInputs, source: MatchSource, options: DirectionOptions, clock: Clock
 ) -> JoinedModel:
     """Return joined models with what can be said of them; `source` has the matches of their images."""
-    first, located = next(iter(group.world_from)), told.located
+    first, located = next(iter(group.world_from)), join_inputs.located
     labels = {
         k: label for one in group.joins for k, label in zip((one.model, one.to), one.labels, strict=True)
     }
     folder = f"joined_{first}" if located else "."
     gauge = Gauge(scale="input", similarity=_SAME, statement="input: those of the first model")
     if first in located:
-        gauge, group = _choose_scale(group, located[first].gauge, told.distances)
+        gauge, group = _choose_scale(group, located[first].gauge, join_inputs.distances)
     model = read_model(group.reconstruction)
     rows = {name: k for k, name in enumerate(model.images.names)}
     tied = np.array([(rows[a], rows[b]) for a, b in group.tied], dtype=np.int64).reshape(-1, 2)
     source = replace(source.at(model.images), tied=tied)
-    found = check_source(model, source, options, clock)
-    seen, measures = found.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
-    cameras = list(joined_camera_rows(found.cameras, group, located))
+    checked = check_source(model, source, options, clock)
+    seen, measures = checked.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
+    cameras = list(joined_camera_rows(checked.cameras, group, located))
     facts = JoinedFacts.taken_from(
         seen,
-        inputs=told.inputs.facts,
-        options=dict(told.options),
+        inputs=join_inputs.inputs.facts,
+        options=dict(join_inputs.options),
         verdict=joined_verdict(seen.verdict, group, located),
         models=[labels[number].removeprefix("model ") for number in group.world_from],
-        joins=[one.facts(folder if one.join and one.model in labels else None) for one in told.joins],
+        joins=[one.facts(folder if one.join and one.model in labels else None) for one in join_inputs.joins],
         num_images=len(cameras),
         num_placed=group.reconstruction.num_reg_images(),
         figures=KeyFigures.of_cameras(cameras, seen.figures.pair_error_deg, *measures),
         sigma_of=_SIGMA_OF if located else "",
         scale=gauge.statement,
         scale_sigma=gauge.scale_sigma,
-        known_distances=told_distances(told.distances, model.images),
+        known_distances=told_distances(join_inputs.distances, model.images),
         datum=EarthDatum.of(gauge.datum),
         timings_s=clock.seconds,
-        warnings=[*told.notes, *seen.warnings, *filter(None, [gauge.warning])],
+        warnings=[*join_inputs.notes, *seen.warnings, *filter(None, [gauge.warning])],
     )
     return JoinedModel(
         reconstruction=group.reconstruction,
         models=tuple(group.world_from),
-        joins=tuple(told.joins),
+        joins=tuple(join_inputs.joins),
         cameras=cameras,
-        pairs=found.pairs,
+        pairs=checked.pairs,
         facts=facts,
     )
 
@@ -255,12 +255,12 @@ def _choose_scale(
     """
     number = next(iter(group.world_from))
     placed = {name_of(image): image for image in group.reconstruction.images.values() if image.has_pose}
-    there = [one for one in known if {*one[:2]} <= placed.keys()]
+    distances = [one for one in known if {*one[:2]} <= placed.keys()]
     warning = ""
-    if first.scale in _ARBITRARY and there:
+    if first.scale in _ARBITRARY and distances:
         centers = np.array([image.projection_center() for image in placed.values()])
         try:
-            gauge = gauge_of_distances(list(placed), centers, there)
+            gauge = gauge_of_distances(list(placed), centers, distances)
         except InputError as error:  # two cameras stand in one place
             warning = str(error)
         else:

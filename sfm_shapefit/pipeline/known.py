@@ -41,12 +41,12 @@ def read_known(
     )
 
 
-def _read_priors(images: Images, file: DatabaseFile | None, asked: Path | str) -> PositionPriors:
-    if str(asked) == PRIORS_OF_DATABASE:
+def _read_priors(images: Images, file: DatabaseFile | None, source: Path | str) -> PositionPriors:
+    if str(source) == PRIORS_OF_DATABASE:
         if file is None:
             raise InputError("there is no database whose priors could be taken; give one (database=FILE)")
         return database_priors(file, images)
-    return exif_priors(Path(asked), images) if Path(asked).is_dir() else table_priors(Path(asked), images)
+    return exif_priors(Path(source), images) if Path(source).is_dir() else table_priors(Path(source), images)
 
 
 def _read_control(images: Images, file: str) -> ControlPoints:
@@ -56,9 +56,9 @@ def _read_control(images: Images, file: str) -> ControlPoints:
     return known
 
 
-def _read_gravity(images: Images, file: DatabaseFile | None, asked: str) -> Gravity:
-    if asked != GRAVITY_OF_DATABASE:
-        return table_gravity(Path(asked), images)
+def _read_gravity(images: Images, file: DatabaseFile | None, source: str) -> Gravity:
+    if source != GRAVITY_OF_DATABASE:
+        return table_gravity(Path(source), images)
     if file is None:
         raise InputError("there is no database whose gravity could be taken; give a table")
     return database_gravity(file, images)
@@ -105,7 +105,6 @@ def read_fixed_images(model: ColmapModel, fix: str) -> BoolArray:
 
 
 def _solved_images(model: ColmapModel) -> BoolArray:
-    """Return which images (n,) observe a 3D point."""
     rows = model.arrays.images.rows(model.images.ids).tolist()
     solved = np.array([len(model.arrays.observed(row)[0]) > 0 for row in rows], dtype=np.bool_)
     if not solved.any():
@@ -114,7 +113,6 @@ def _solved_images(model: ColmapModel) -> BoolArray:
 
 
 def _named_images(model: ColmapModel, path: Path) -> BoolArray:
-    """Return which images (n,) a file names, one a line."""
     fixed = np.zeros(model.images.num_images, dtype=np.bool_)
     lines = [(n, line.strip()) for n, line in enumerate(text_of(path).splitlines(), start=1)]
     listed = [(number, name) for number, name in lines if name and not name.startswith("#")]

@@ -107,7 +107,7 @@ def locate(
         is_rough = pull_rad is not None and _ROUGH_RAD <= pull_rad < np.inf
         if is_rough and fixed.any():
             is_rough, notes = False, (_NOT_CORRECTED, *notes)
-        told = RunInputs(
+        run_inputs = RunInputs(
             options=options,
             template=template,
             images=images,
@@ -120,5 +120,5 @@ def locate(
             known=known,
         )
         with naming_convention(source, clock.threads):
-            found = tell_convention(make_model(told, source, clock), source, clock.threads)
-        return replace(found, warnings=(*notes, *found.warnings)) if notes else found
+            result = tell_convention(make_model(run_inputs, source, clock), source, clock.threads)
+        return replace(result, warnings=(*notes, *result.warnings)) if notes else result

@@ -80,7 +80,7 @@ def map_opened(
     if not models:
         raise UnsolvableError(_explain_failure(file, relative, reasons))
     with clock("join") if options.join == "safe" else nullcontext():
-        joins, joined, told = join_mapped(models, run)
+        joins, joined, join_warnings = join_mapped(models, run)
     left_out = {**run.read.left_out} | {
         name: reasons[frame]
         for name, frame in zip(run.images.names, run.frame_of_image.tolist(), strict=True)
@@ -101,7 +101,7 @@ def map_opened(
             *file.notes,
             *(run.known.priors.notes if run.known.priors is not None else ()),
             *map_warnings(run.read.rigs.incomplete, models, left_out),
-            *told,
+            *join_warnings,
             *lost_distances(run.options.gauge.known_distance, models, joined),
         ),
     )
@@ -126,7 +126,6 @@ def measure_run(run: MapContext) -> tuple[MapContext, RelativeRotations, Videos,
 
 
 def _explain_failure(file: DatabaseFile, relative: RelativeRotations, reasons: dict[int, str]) -> str:
-    """Say why no component could be placed."""
     if len(relative.pairs) == 0:
         return explain_no_pairs(file) or (
             f"no pair of images in {file.path} has {LEAST_MATCHES} inlier matches and a relative rotation; "

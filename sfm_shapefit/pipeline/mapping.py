@@ -47,7 +47,7 @@ def refine_intrinsics(run: MapContext, relative: RelativeRotations) -> Images:
     ones among them; a placement that is wrong in places knows the focal length all the same. Where a
     camera is in several components, the one with most images counts.
     """
-    found, is_found = run.images, np.zeros(len(run.images.lenses), dtype=np.bool_)
+    images, is_known = run.images, np.zeros(len(run.images.lenses), dtype=np.bool_)
     for _, members, averaging in run.average_images(relative, {}):
         inputs = _inputs_of(run, members, averaging).without_positions()
         source = see_within_limit(see_matches(run.matches, inputs.images, run.inputs), run.options)
@@ -57,9 +57,9 @@ def refine_intrinsics(run: MapContext, relative: RelativeRotations) -> Images:
             except ContradictedOffsetsError:  # by directions of lenses that are not known yet
                 first = _place_first(*at_one_center(inputs, source), run.clock)
             rows = run.images.lenses_of(first.images)
-            found = found.with_lenses_of(first.images, first.is_tried & ~is_found[rows])
-            is_found[rows] |= first.is_tried
-    return found
+            images = images.with_lenses_of(first.images, first.is_tried & ~is_known[rows])
+            is_known[rows] |= first.is_tried
+    return images
 
 
 def _place_first(inputs: RunInputs, source: MatchSource, clock: Clock) -> Estimate:
@@ -99,8 +99,8 @@ def _rigid_models(component: MappedModel, least: int) -> Iterator[MappedModel]:
     first = component.located
     large = [piece for piece in first.further if int(piece.kept.sum()) >= least]
     rest = tuple(piece for piece in first.further if piece not in large)
-    there = np.any([piece.placed.is_posed for piece in (first, *large)], axis=0)
-    first, *large = (replace(one, elsewhere=there & ~one.placed.is_posed) for one in (first, *large))
+    placed = np.any([piece.placed.is_posed for piece in (first, *large)], axis=0)
+    first, *large = (replace(one, elsewhere=placed & ~one.placed.is_posed) for one in (first, *large))
     yield replace(component, located=replace(first, further=rest))
     for piece in large:
         rows = np.sort(piece.placement.cameras)
@@ -118,16 +118,15 @@ def _locate_component(
         read = replace(read, left_out=read.left_out | _false_pairs(inputs.images, among, averaging))
     source = see_within_limit(see_matches(run.matches, inputs.images, read), run.options)
     source = replace(source, alone=among)
-    found = make_model(inputs, source, run.clock)
+    result = make_model(inputs, source, run.clock)
     return replace(
-        found,
-        scores=run.scores.of(members[found.directions.pairs]),
-        suspicions=(*found.suspicions, *_suspicions(averaging)),
+        result,
+        scores=run.scores.of(members[result.directions.pairs]),
+        suspicions=(*result.suspicions, *_suspicions(averaging)),
     )
 
 
 def _inputs_of(run: MapContext, members: IntArray, averaging: AveragedRotations) -> RunInputs:
-    """Return what the models of a component's images are made by."""
     images, known = run.pose(members, averaging.rotations), run.known.of(members)
     if known.priors is not None:  # without notes: the run says them once
         known = replace(known, priors=replace(known.priors, notes=()) if len(known.priors) else None)
@@ -162,7 +161,6 @@ def _suspicions(averaging: AveragedRotations) -> Iterator[Reason]:
 
 
 def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) -> Iterator[Loop]:
-    """Yield the visits that begin among some images, by name."""
     for visit in visits:
         first, second = ((names[a], names[b]) for a, b in (visit.first, visit.second))
         if first[0] in among:
@@ -194,11 +192,11 @@ def join_mapped(
     tied = tie_pieces(pieces, run.matches, run.without)
     joins = list(judge_joins(pieces, tied, priors))
     options, inputs = run.options, run.inputs
-    told = JoinInputs(joins, flat_values(options), inputs, options.gauge.known_distance, located)
+    join_inputs = JoinInputs(joins, flat_values(options), inputs, options.gauge.known_distance, located)
     joined = []
     for group in merge_groups(pieces, tied, joins):
         source = see_matches(run.matches, read_model(group.reconstruction).images, inputs)
-        joined.append(tell_group(group, told, source, options.directions, run.clock.anew()))
+        joined.append(tell_group(group, join_inputs, source, options.directions, run.clock.anew()))
     return tuple(joins), tuple(joined), tuple(warnings)
 
 
@@ -215,7 +213,7 @@ def _priors_of(
         except InputError as error:
             warnings.append(f"the position priors of the database join no models: {error}")
     for piece in pieces:
-        own = (
+        piece_priors = (
             None if priors is None else priors.of(np.searchsorted(run.images.names, piece.model.images.names))
         )
-        yield own if own else None
+        yield piece_priors if piece_priors else None

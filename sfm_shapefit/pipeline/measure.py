@@ -95,11 +95,11 @@ def measure(
             "no two posed images share matches; match the images, or give the database that has their matches"
             f"{source.matches.lacking and f' ({source.matches.lacking})'}"
         )
-    directions, asked = concatenate(parts), beside.joiner is None and wanted.tracks == "auto"
-    if asked and not _is_held_by_pairs(view_graph(source.images, directions)):
+    directions, tracks_open = concatenate(parts), beside.joiner is None and wanted.tracks == "auto"
+    if tracks_open and not _is_held_by_pairs(view_graph(source.images, directions)):
         beside.joiner = _new_joiner(source, options.inlier_threshold_px)
-        for batch, own in _again(source, directions):
-            beside.joiner.add(batch, own)
+        for batch, batch_directions in _again(source, directions):
+            beside.joiner.add(batch, batch_directions)
     return MeasuredPairs(
         directions=directions,
         tracks=beside.joiner,
@@ -146,8 +146,8 @@ class _SideResults:
         usable = directions.usable()
         self._num_usable += len(usable)
         for row in usable.tolist() if self._counts_pairs else ():  # faster than `np.add.at`
-            own = batch.keypoints[batch.offsets[row] : batch.offsets[row + 1]]
-            self._num_pairs_of[self._begins[batch.pairs[row]] + own] += 1
+            keypoints = batch.keypoints[batch.offsets[row] : batch.offsets[row + 1]]
+            self._num_pairs_of[self._begins[batch.pairs[row]] + keypoints] += 1
         if self._num_usable > _MAX_SAMPLED_PAIRS:
             self.errors = None
         if self.errors is not None:
@@ -222,10 +222,10 @@ def add_evidence(graph: MeasuredGraph, measured: MeasuredPairs) -> MeasuredGraph
     """
     assert graph.covariance is not None
     directions, usable = measured.directions, measured.directions.usable()
-    own = graph.covariance[len(usable) :]
+    ray_covariance = graph.covariance[len(usable) :]
     errors = None
     if measured.errors is not None:
-        errors = np.empty((graph.graph.num_edges, NUM_SAMPLES, own.shape[1]))
+        errors = np.empty((graph.graph.num_edges, NUM_SAMPLES, ray_covariance.shape[1]))
         filled = 0
         while measured.errors:
             part = measured.errors.pop(0)
@@ -233,7 +233,7 @@ def add_evidence(graph: MeasuredGraph, measured: MeasuredPairs) -> MeasuredGraph
             filled += len(part)
         drawn = errors[filled:]  # in place
         np.random.default_rng(0).standard_normal(out=drawn)
-        drawn *= np.sqrt(np.diagonal(own, axis1=1, axis2=2))[:, None, :]
+        drawn *= np.sqrt(np.diagonal(ray_covariance, axis1=1, axis2=2))[:, None, :]
     evidence = Evidence(
         contradicting=directions.pairs[directions.contradicting()].reshape(-1, 2),
         errors=errors,

@@ -133,7 +133,6 @@ def describe_work(measured: MeasuredGraph, work: Workload, options: PlacementOpt
 
 
 def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
-    """Return the bytes that are held at the peak of each stage."""
     batch = 225.0 * min(plan.reading.batch, work.num_matches)
     model = 30e6 + (_COLOR_BYTES if work.num_matches else _MODEL_BYTES) * work.num_keypoints
     rays = min(24.0 * work.num_keypoints, plan.reading.rays_bytes)

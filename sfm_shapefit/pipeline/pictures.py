@@ -45,22 +45,24 @@ class AskedPictures:
 
 
 @contextmanager
-def match_pictures(model: ColmapModel, asked: AskedPictures, clock: Clock) -> Iterator[Inputs]:
+def match_pictures(model: ColmapModel, request: AskedPictures, clock: Clock) -> Iterator[Inputs]:
     """Yield the inputs that a model's pictures make: a database, which is gone afterwards.
 
     Raises:
         InputError: if fewer than two pictures can be read.
     """
-    refuse_no_folder(asked.folder)
-    began, minutes = time.monotonic(), np.inf if asked.max_minutes is None else asked.max_minutes
+    refuse_no_folder(request.folder)
+    began, minutes = time.monotonic(), np.inf if request.max_minutes is None else request.max_minutes
     with TemporaryDirectory(prefix="shapefit-") as scratch:
         path = Path(scratch) / "database.db"
         pictures = PictureMatches(model=model, database=path, threads=clock.threads)
         with clock("features"):
             states = pictures.detect(
-                asked.folder, lambda: time.monotonic() > began + 60.0 * _FOR_FEATURES * minutes, clock.advance
+                request.folder,
+                lambda: time.monotonic() > began + 60.0 * _FOR_FEATURES * minutes,
+                clock.advance,
             )
-        _refuse_no_pictures(asked.folder, model.images.names, states)
+        _refuse_no_pictures(request.folder, model.images.names, states)
         tracks = TrackMatches(model)
         shared = Shared(tracks.pairs, tracks.num_matches)
         chosen = choose_pairs(
@@ -71,10 +73,10 @@ def match_pictures(model: ColmapModel, asked: AskedPictures, clock: Clock) -> It
                 chosen.pairs, lambda: time.monotonic() > began + 60.0 * minutes, clock.advance
             )
         pictures.name_images()
-        statement = _state(asked.folder, states, chosen.reasons, count)
+        statement = _state(request.folder, states, chosen.reasons, count)
         rows, names = chosen.pairs[~chosen.is_near].tolist(), model.images.names
         far = frozenset((min(names[i], names[j]), max(names[i], names[j])) for i, j in rows)
-        yield Inputs(folder=None, database=path, statement=statement, images=asked.folder, far=far)
+        yield Inputs(folder=None, database=path, statement=statement, images=request.folder, far=far)
 
 
 def _refuse_no_pictures(folder: Path, names: Sequence[str], states: Sequence[str]) -> None:
@@ -91,10 +93,10 @@ def _state(folder: Path, states: Sequence[str], reasons: Sequence[str], count: i
     """Say what was asked, why, and what was not."""
     others = _whys(states)
     without = f" ({others})" if others else ""
-    asked = counted(count, "pair") if count == len(reasons) else f"{count:,} of {len(reasons):,} chosen pairs"
+    pairs = counted(count, "pair") if count == len(reasons) else f"{count:,} of {len(reasons):,} chosen pairs"
     num_asked = states.count("asked")
     pictures = f"{num_asked:,} of {counted(len(states), 'picture')}{without} in {folder}"
-    return f"{pictures}, {asked}: {_whys(reasons[:count])}"
+    return f"{pictures}, {pairs}: {_whys(reasons[:count])}"
 
 
 def _whys(whys: Sequence[str]) -> str:

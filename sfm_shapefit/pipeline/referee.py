@@ -239,7 +239,7 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
     pairs = [] if fits is None else _pair_rows(state.images, fits)
     named = [one for one in state.reasons if one.of_each and one.kind is not Kind.SECOND_OPINION]
     cameras = _camera_rows(model, pairs, [*state.weak, *(one for one in named if one not in state.weak)])
-    told = tell_evidence(state.evidence, state.images)
+    evidence = tell_evidence(state.evidence, state.images)
     error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
     errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
     facts = CheckedFacts(
@@ -264,8 +264,8 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
         median_track_length=_median(quality.point_track_lengths.tolist()),
         residual_level_deg=np.nan if fits is None else fits.level_deg,
         timings_s=clock.seconds,
-        evidence=told,
-        warnings=[*model.notes, *source.matches.notes, *told.statements],
+        evidence=evidence,
+        warnings=[*model.notes, *source.matches.notes, *evidence.statements],
     )
     return CheckResult(
         model=model,
@@ -287,7 +287,6 @@ def _of_alike_pictures(findings: Iterable[Reason]) -> Iterator[Reason]:
 
 
 def _pair_rows(images: Images, fits: PairFits) -> list[PairRow]:
-    """Return a row per pair."""
     rows, directions = [], fits.directions
     for e, status in enumerate(directions.status):
         i, j = directions.pairs[e]
@@ -360,9 +359,9 @@ def _none_agrees(fits: PairFits, source: MatchSource) -> Iterator[Reason]:
     """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
     if (against := int(fits.contradicts.sum())) and not fits.agrees.any():
         whose = ARE_ITS_PICTURES if source.inputs.is_made else IS_ITS_DATABASE
-        asked = f": {whose}" * (source.inputs.database is not None)
+        question = f": {whose}" * (source.inputs.database is not None)
         pairs = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
-        yield of_model(Kind.INPUT, f"{pairs} and none agrees{asked}", Grade.DO_NOT_USE)
+        yield of_model(Kind.INPUT, f"{pairs} and none agrees{question}", Grade.DO_NOT_USE)
 
 
 def _median(values: list[float]) -> float:

@@ -80,8 +80,8 @@ def relative_rotations(
     with clock("relative rotations"), closing(DatabaseFile(database)) as file:
         images = read_images(file).images
         view = DatabaseMatches(file, images.names).at(images.apart())
-        found = measure_rotations(view, min_matches, clock)
-    columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
+        measured = measure_rotations(view, min_matches, clock)
+    columns = {field.name: getattr(measured, field.name) for field in fields(RelativeRotations)}
     return DatabaseRotations(**columns, names=images.names)
 
 
@@ -126,8 +126,8 @@ def estimate_near(
     """
     i, j = batch.pairs.T
     turns = np.nan_to_num(rotations[j] @ rotations[i].transpose(0, 2, 1))
-    rays_i, own = np.empty_like(batch.rays_i), itertools.pairwise(batch.offsets.tolist())
-    for (first, last), turn in zip(own, turns.transpose(0, 2, 1), strict=True):
+    rays_i, bounds = np.empty_like(batch.rays_i), itertools.pairwise(batch.offsets.tolist())
+    for (first, last), turn in zip(bounds, turns.transpose(0, 2, 1), strict=True):
         np.matmul(batch.rays_i[first:last], turn, out=rays_i[first:last])
     in_axes_of_j = replace(batch, rays_i=rays_i)
     baselines = estimate_directions(in_axes_of_j, _NEAR, threads).directions
@@ -155,14 +155,14 @@ def estimate_here(
 
     `estimate` is called with a batch, the number of threads, and whom to tell of pairs that are done.
     """
-    parts, before, total = [], 0, view.num_pairs
+    parts, num_before, total = [], 0, view.num_pairs
     for batch in view.batches(min_matches, without):
 
-        def advance(done: int, before: int = before) -> None:
-            clock.advance(before + done, total)
+        def advance(done: int, num_before: int = num_before) -> None:
+            clock.advance(num_before + done, total)
 
         parts.append(estimate(batch, clock.threads, advance))
-        before += len(batch.pairs)
+        num_before += len(batch.pairs)
     if without is None:
         clock.advance(total, total)
     return concatenate_rotations(parts)

@@ -36,7 +36,7 @@ def select_trusted(placement: Judged, min_trust: float) -> BoolArray:
     return kept if np.sum(kept) >= _FEWEST_KEPT else np.ones_like(kept)
 
 
-def seed_points(state: ModelState, clock: Clock, sure: BoolArray | None = None) -> ModelState:
+def seed_points(state: ModelState, clock: Clock, confirmed: BoolArray | None = None) -> ModelState:
     """Move the kept cameras, triangulate points, and adjust both if asked for.
 
     Bundle adjustment is free to scale, shift and turn everything; the gauge is set after it. Half of the
@@ -46,8 +46,8 @@ def seed_points(state: ModelState, clock: Clock, sure: BoolArray | None = None) 
     images, points, bundle, partners = _make_points(state, clock)
     hand_back_memory()  # the links are gone
     least = np.full(len(fixed), options.structure.min_points_per_image)
-    if sure is not None:
-        least[images.frame_of[sure]] = (least[images.frame_of[sure]] + 1) // 2
+    if confirmed is not None:
+        least[images.frame_of[confirmed]] = (least[images.frame_of[confirmed]] + 1) // 2
     seen = images_of_few_points(points, images, least, fixed)
     images, points = _leave_out(seen >= 0, images, points)
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)
@@ -92,7 +92,6 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
 
 
 def _count(links: Links, images: Images, partners: PartnerCounts) -> PartnerCounts:
-    """Count matches between all posed ones of some images."""
     if isinstance(links, MatchedKeypoints):
         rows = images.posed_rows
         posed = images.part(rows)

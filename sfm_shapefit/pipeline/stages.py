@@ -89,7 +89,6 @@ def place_rigid_pieces(state: ModelState, clock: Clock) -> list[ModelState]:
 
 
 def _begin_piece(state: ModelState, placement: Placement) -> ModelState:
-    """Return the state of one of the pieces, in the frame of all its cameras."""
     if placement.piece:
         free = np.zeros_like(state.inputs.fixed)
         inputs = replace(state.inputs.without_positions(), fixed=free)
@@ -135,8 +134,8 @@ def judge_piece(state: ModelState, clock: Clock) -> ModelState:
         if not source.has_database:  # its points were made for one placement, and hold no second one
             judged = replace(judged, second_configuration=None)
         judged = _with_known_errors(judged, state).without_error_samples()
-        sure = None if source.has_database else fit[judged.cameras]
-        return _choose(state, doubt_cameras(judged, state.directions, relative, source.images, sure))
+        fitting = None if source.has_database else fit[judged.cameras]
+        return _choose(state, doubt_cameras(judged, state.directions, relative, source.images, fitting))
 
 
 def _with_known_errors(judged: Judged, state: ModelState) -> Judged:
@@ -150,11 +149,11 @@ def _with_known_errors(judged: Judged, state: ModelState) -> Judged:
     if state.first is None or state.near is None:
         return judged
     centers = state.near.locations[judged.cameras]
-    there = np.isfinite(centers).all(axis=1)
-    if there.sum() < 2:
+    common = np.isfinite(centers).all(axis=1)
+    if common.sum() < 2:
         return judged
-    before, now = median_spread(centers[there]), median_spread(judged.locations[there])
-    return with_uncertainty(judged, images, state.first, before / now) if min(before, now) > 0.0 else judged
+    old, new = median_spread(centers[common]), median_spread(judged.locations[common])
+    return with_uncertainty(judged, images, state.first, old / new) if min(old, new) > 0.0 else judged
 
 
 def _choose(state: ModelState, judged: Judged) -> ModelState:
@@ -169,13 +168,13 @@ def seed_model(state: ModelState, clock: Clock) -> ModelState:
     """Give the kept cameras points; once more where the pixels confirm a camera that was left out."""
     seeded = seed_points(state, clock)
     with clock("trust"):
-        sure = confirm_by_pixels(seeded)
-    if sure.any():
+        by_pixels = confirm_by_pixels(seeded)
+    if by_pixels.any():
         judged = state.judged
-        assessment = confirm_cameras(judged.assessment, sure[judged.cameras])
+        assessment = confirm_cameras(judged.assessment, by_pixels[judged.cameras])
         confirmed = _choose(state, replace(judged, assessment=assessment))
-        if (sure & ~seeded.images.is_posed).any():
-            seeded = seed_points(confirmed, clock, sure)
+        if (by_pixels & ~seeded.images.is_posed).any():
+            seeded = seed_points(confirmed, clock, by_pixels)
         else:
             seeded = replace(seeded, placement=confirmed.placement, kept=confirmed.kept)
     seeded = replace(seeded, kept=seeded.kept & seeded.images.is_posed[seeded.placement.cameras])

@@ -92,9 +92,9 @@ def adjust_first_placement(
         )
     rotations, centers = images.rotations.copy(), np.full((images.num_images, 3), np.nan)
     rotations[rows], centers[rows] = adjusted.images.rotations, adjusted.images.centers
-    there = np.isfinite(centers).all(axis=1)
-    common = mean_rotation_l1(images.rotations[there].transpose(0, 2, 1) @ rotations[there])
-    rotations[~there] = images.rotations[~there] @ common
+    known = np.isfinite(centers).all(axis=1)
+    common = mean_rotation_l1(images.rotations[known].transpose(0, 2, 1) @ rotations[known])
+    rotations[~known] = images.rotations[~known] @ common
     intrinsics = state.intrinsics.after(adjusted, images.lenses_of(adjusted.images))
     images = images.with_lenses_of(adjusted.images, adjusted.is_tried)
     if adjusted.refines_sensors:
@@ -163,14 +163,14 @@ def average_near(rough: Images, relative: RelativeRotations, threads: int) -> Im
 
     Images that no pair ties to the largest component keep their own.
     """
-    own, sensors = rough.frames.rotations, rough.sensors.rotations[rough.lens_of]
+    given, sensors = rough.frames.rotations, rough.sensors.rotations[rough.lens_of]
     of_frames = relative_rotations_of_frames(relative, rough.frame_of, sensors)
     if not len(of_frames.pairs):
         return rough
-    averaged = average_relative_rotations(len(own), of_frames, threads)
+    averaged = average_relative_rotations(len(given), of_frames, threads)
     known = averaged.registered
-    common = mean_rotation_l1(averaged.rotations[known].transpose(0, 2, 1) @ own[known])
-    turned: FloatArray = np.where(known[:, None, None], averaged.rotations @ common, own)
+    common = mean_rotation_l1(averaged.rotations[known].transpose(0, 2, 1) @ given[known])
+    turned: FloatArray = np.where(known[:, None, None], averaged.rotations @ common, given)
     return rough.posed(turned, np.zeros_like(rough.frames.centers))
 
 

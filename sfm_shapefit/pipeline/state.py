@@ -113,8 +113,8 @@ class ModelState:
         if self.adjustment is None:
             rigs = self.rigid.groups is not None
             return Freedom.asked(self.inputs.options.freedom, self.intrinsics.parts, rigs=rigs)
-        every, own = self.source.images.frames.ids, self.adjustment.images.frames.ids
-        freedom = self.adjustment.freedom.among(np.searchsorted(every, own), len(every))
+        every, adjusted = self.source.images.frames.ids, self.adjustment.images.frames.ids
+        freedom = self.adjustment.freedom.among(np.searchsorted(every, adjusted), len(every))
         return replace(freedom, parts=self.intrinsics.parts)
 
     @property
@@ -179,8 +179,8 @@ class ModelState:
 
     def pictures(self, images: Images, rows: IntArray) -> ModelPictures:
         """Return the keypoints of some images (r,), and their lenses."""
-        own, view = rows.tolist(), self.source.view
-        return ModelPictures(images.part(rows), lambda k: view.keypoints(own[k]), view.num_keypoints[rows])
+        chosen, view = rows.tolist(), self.source.view
+        return ModelPictures(images.part(rows), lambda k: view.keypoints(chosen[k]), view.num_keypoints[rows])
 
     def read_links(self, images: Images, advance: Advance, *, rejected: bool = False) -> Links:
         """Return what joins the keypoints of posed images, or matches of rejected pairs; rays are forgotten.

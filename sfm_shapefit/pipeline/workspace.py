@@ -97,7 +97,7 @@ def workspace(
     clock = Clock.of(progress)
     with clock("read"):
         read = read_by_itself(model_of(model), with_lenses=True)
-        turn, said = _level(read, model) if level == "auto" else (None, "its axes stay, as asked")
+        turn, statement = _level(read, model) if level == "auto" else (None, "its axes stay, as asked")
         leveled = read.reconstruction if turn is None else transform_model(read.reconstruction, turn)
     protect = [images, *([model] if isinstance(model, Path | str) else [])]
     with atomic_folder(out, protect=protect) as folder:
@@ -120,12 +120,11 @@ def workspace(
             made = flatten_model(colored, flats)
             _write_models(read_model(made), folder)
     return Workspace(
-        folder=Path(out), reconstruction=made, level=said, warnings=(*read.notes, *_warn(made, reasons))
+        folder=Path(out), reconstruction=made, level=statement, warnings=(*read.notes, *_warn(made, reasons))
     )
 
 
 def _warn(made: "pycolmap.Reconstruction", reasons: Mapping[str, str]) -> Iterator[str]:
-    """Yield what is missing, a sentence each."""
     for why in dict.fromkeys(reasons.values()):
         names = [name for name, reason in reasons.items() if reason == why]
         yield f"{counted_are(len(names), 'image')} left out ({why}): {first_of(names)}"
@@ -153,7 +152,6 @@ def _level(read: ColmapModel, source: ModelSource) -> tuple[Similarity | None, s
 
 
 def _write_models(model: ColmapModel, folder: Path) -> None:
-    """Write a model as each program looks for it."""
     sparse, stereo = folder / "sparse", folder / "stereo"
     (sparse / "0").mkdir(parents=True)
     write_model(model.reconstruction, sparse / "0")

@@ -161,7 +161,6 @@ def _color_warnings(folder: Path, names: Sequence[str], unread: Sequence[str]) -
 
 
 def _inputs_of(found: Any) -> list[Path]:
-    """Return the files and folders that a result was made of."""
     if isinstance(found, LocateResult):
         return [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
     if isinstance(found, MapResult) and found.images is not None:
@@ -175,7 +174,6 @@ def _inputs_of(found: Any) -> list[Path]:
 def _write_files(
     found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions
 ) -> None:
-    """Write the files of one placed model or graph, or of models that were joined."""
     if isinstance(found, LocateResult):
         write_model(found.model, folder)
     elif isinstance(found, JoinedModel):
@@ -271,7 +269,6 @@ def _is_same(page: Path, other: Path) -> bool:
 
 
 def _draw_page(found: Any) -> str:
-    """Return the page of a result's report, as notebooks show it."""
     from sfm_shapefit.report.page import report_html
 
     return report_html(_drawing_of(found), found.facts)

@@ -113,7 +113,6 @@ class AveragingSystem:
         return self._factor_of(3).refactor_blocks(self.pairs, diagonal, blocks)
 
     def _factor_of(self, block: int) -> CholeskyFactor:
-        """Return the memory of the factor with blocks of that size."""
         assert self.plan is not None
         if block not in self._factors:
             self._factors[block] = allocate_factor(self.plan, block, threads=self.threads)

@@ -317,7 +317,6 @@ class Lens:
         return sound and sigma <= LARGEST_SIGMA and (better or contradicts)
 
     def _is_sound(self) -> bool:
-        """Return whether the distortion is one that lenses have."""
         if self.is_plane:
             return bool(np.abs(self.values()[_DISTORTION]).max() <= _MOST_DISTORTION)
         row = self.row()

@@ -71,7 +71,6 @@ class RayMatches(Lists):
         return self._taken(offsets, np.repeat(self.offsets[:-1], taken) + steps)
 
     def _taken(self, offsets: IntArray, rows: IntArray) -> "RayMatches":
-        """Return the pairs with other matches, by rows."""
         return RayMatches(
             pairs=self.pairs,
             offsets=offsets,
@@ -292,7 +291,6 @@ class View:
         return self._consumed(found)
 
     def _consumed(self, links: Iterator[KeypointMatches]) -> Iterator[KeypointMatches]:
-        """Yield the last matches of these for a while."""
         yield from links
         self.give_back()  # rays too, by which those without one are told
 
@@ -323,7 +321,6 @@ class View:
         advance(self.num_pairs, self.num_pairs)
 
     def _batches(self, chosen: IntArray, min_matches: int) -> Iterator[MatchBatch]:
-        """Yield the matches of chosen pairs with their rays."""
         for found in self._links(chosen, min_matches):
             self._keep_rays(np.unique(found.pairs))
             rows = np.repeat(self._begins[found.pairs], np.diff(found.offsets), axis=0) + found.keypoints
@@ -344,7 +341,6 @@ class View:
                 yield batch
 
     def _keypoint_batch(self, chosen: IntArray, min_matches: int) -> KeypointMatches:
-        """Return the matches of some of the chosen pairs."""
         pairs = self.pairs[chosen]
         all_see = all(self._blind_of(image) is None for image in np.unique(pairs).tolist())
         counts, keypoints = self.matches.read(self.rows[chosen], keep=self.reading.keeps)
@@ -393,7 +389,6 @@ class View:
             self.matches.forget()
 
     def _forget_rays(self) -> None:
-        """Give back the memory of the rays of keypoints."""
         self._rays, self._num_rays = np.empty((0, 3)), 0
         self._begins = np.full(self.images.num_images, -1)
 

@@ -110,7 +110,6 @@ def _first_tail(name: str, names: Collection[str]) -> str | None:
 
 
 def _grouped(keys: Iterable[str]) -> dict[str, list[int]]:
-    """Return the places of each key."""
     places: dict[str, list[int]] = {}
     for place, key in enumerate(keys):
         places.setdefault(key, []).append(place)

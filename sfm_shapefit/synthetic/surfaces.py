@@ -50,8 +50,6 @@ class Surfaces:
 
 
 class _Part(NamedTuple):
-    """A mesh with its picture."""
-
     corners: FloatArray
     texels: FloatArray
     normals: FloatArray

@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion, fit_pairs
 from sfm_shapefit.judgement.image_quality import find_weak_images
 from sfm_shapefit.judgement.reasons import Grade, Kind, of_each
 from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pipeline.pictures import points_of_pictures
 from sfm_shapefit.pipeline.referee import (
     CheckState,
     OtherModel,
@@ -70,6 +73,20 @@ def test_directions_fit_the_true_cameras_and_contradict_one_that_stands_elsewher
     assert right.agrees.all()
     assert wrong.contradicts.any()
     assert (wrong.directions.pairs[wrong.contradicts] == 2).any(axis=1).all()
+
+
+def test_points_of_pictures_are_those_that_agreeing_pairs_see_where_the_cameras_stand():
+    with opened() as source:
+        fits = fit_pairs(TRUTH.centers, directions_of(TRUTH, source.view.pairs))
+        every = points_of_pictures(source, fits).points
+        without = replace(fits, contradicts=(fits.directions.pairs == 2).any(axis=1))
+        some = points_of_pictures(source, without).points
+    known = points_of(MODEL.arrays, TRUTH)
+    nearest = cKDTree(known.xyz).query(every.xyz)[0]
+    assert np.median(nearest) < 1e-3 * np.ptp(TRUTH.centers)
+    assert 2 in every.images
+    assert 2 not in some.images
+    assert some.num_points > 100
 
 
 def test_evidence_names_the_camera_that_pairs_put_elsewhere():

@@ -31,6 +31,7 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.joining import judge_joins
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.write import write_result
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 from sfm_shapefit.placement.gauge_rule import GaugeRule
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.points import number_points
@@ -193,7 +194,7 @@ def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace
     images, every = read_model(workspace / "truth").images, np.arange(36)
     apart = float(np.linalg.norm(images.centers[0] - images.centers[20]))
     distances = ((images.names[0], images.names[20], 2.0 * apart),)
-    rigid = rigs_stage.find_fixed_and_rigged(images, every < 0)
+    rigid = find_fixed_and_rigged(images, every < 0)
     rule = GaugeRule(images, rigid, "unit", made_priors(3.0 * images.centers), distances)
     chosen = rule.choose(every, 0.1 * images.centers, 0.1)
     assert chosen.scale == "rig"

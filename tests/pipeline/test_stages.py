@@ -45,6 +45,7 @@ from sfm_shapefit.pipeline.stages import (
     seed_model,
     set_gauge,
 )
+from sfm_shapefit.pipeline.starts import begin_model
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 from sfm_shapefit.placement.gauge_rule import GaugeRule
@@ -117,6 +118,33 @@ def test_many_cameras_that_pairs_of_many_directions_hold_need_no_points(monkeypa
     assert usual.num_tracks > 10
     np.testing.assert_array_equal(own.rays, usual.rays)
     np.testing.assert_array_equal(own.offsets, usual.offsets)
+
+
+@pytest.mark.parametrize(
+    ("known", "off_deg"),
+    [({}, 0.1), ({"is_component": True}, 0.1), ({"rough_rad": np.radians(2.0)}, 2.0)],
+    ids=["given", "averaged", "rough"],
+)
+def test_begin_takes_rotations_as_they_are_or_makes_averaged_and_rough_ones_finer(known, off_deg):
+    rng = np.random.default_rng(0)
+    errors = Rotation.from_rotvec(np.radians(off_deg) * rng.standard_normal((8, 3))).as_matrix()
+    turns = dict(zip(TRUTH.names, errors, strict=True))
+    off = posed(FOLDER, lambda name, rotation, center: (turns[name] @ rotation, center))
+    with opened(off) as source:
+        priors = made_priors(TRUTH.centers)
+        inputs = replace(state_at(source, TRUTH.centers, priors=priors, pull_rad=np.inf).inputs, **known)
+        state = begin_model(inputs, source, Clock())
+    assert state.inputs is inputs  # positions are known again after a first placement
+    assert state.warnings == ()
+    turned = TRUTH.rotations.transpose(0, 2, 1) @ state.source.images.rotations
+    left_deg = rotation_angles_deg(turned @ mean_rotation_l1(turned).T)
+    if not known:
+        assert (state.first, state.near) == (None, None)
+        assert left_deg.max() > 0.1
+        return
+    assert left_deg.max() < 0.02  # keypoints are off by 0.3 px, a fiftieth of a degree
+    placed = fit_similarity(state.near.locations, TRUTH.centers).apply(state.near.locations)
+    assert np.abs(placed - TRUTH.centers).max() < 0.01 * np.ptp(TRUTH.centers)
 
 
 def test_measured_directions_are_those_of_the_true_cameras():

@@ -111,5 +111,4 @@ def _defaults(name: str) -> tuple[float, ...]:
 
 
 def _listed(params: Sequence[float]) -> str:
-    """Return parameters as words."""
     return " ".join(f"{value:g}" for value in params)

@@ -32,8 +32,6 @@ _LINE = "x y z, two pixel coordinates, the name of an image, and perhaps that of
 
 
 class _Mark(NamedTuple):
-    """A line of the file."""
-
     number: int
     position: tuple[float, float, float]
     pixel: tuple[float, float]
@@ -126,7 +124,6 @@ def look_at_marks(images: Images, known: ControlPoints) -> MarkedViews:
 
 
 def _parse(path: Path, number: int, line: str) -> _Mark:
-    """Return the mark of a line."""
     cells = [cell.strip() for cell in (line.split("\t") if line.count("\t") >= 5 else line.split())]
     if len(cells) < 6 or not all(map(is_number, cells[:5])):
         raise InputError(f"{path}, line {number}: expected {_LINE}")

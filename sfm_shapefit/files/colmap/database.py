@@ -174,7 +174,6 @@ class DatabaseMatches(Matches):
         return pixels
 
     def _read_keypoints(self, name: str) -> npt.NDArray[np.float32]:
-        """Return the same from the file."""
         query = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
         found = self.file.query(query, self._ids[name]) if name in self._ids else []
         rows, cols, data = found[0] if found else (0, 0, b"")

@@ -103,7 +103,6 @@ def explain_no_pairs(file: DatabaseFile) -> str:
 
 
 def _has_rows(file: DatabaseFile, table: str) -> bool:
-    """Return whether an image or a pair of a table has anything."""
     return bool(file.query(f"SELECT 1 FROM {table} WHERE typeof(rows) != 'integer' OR rows != 0 LIMIT 1"))
 
 

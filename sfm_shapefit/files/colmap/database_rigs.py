@@ -97,7 +97,6 @@ def _rows(file: DatabaseFile, table: str, columns: tuple[str, ...], kind: str = 
 
 
 def _refuse_unknown_camera(path: Path, cameras: Collection[int], rig_id: object, *camera_ids: Any) -> None:
-    """Raise InputError if a rig has a camera that the database has not."""
     for camera_id in camera_ids:
         if not (is_between(camera_id, 0, NO_ID) and camera_id in cameras):
             raise InputError(f"{path}: rig {rig_id} refers to camera {camera_id!r}, which is not there")

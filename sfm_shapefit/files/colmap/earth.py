@@ -65,7 +65,6 @@ def _zone_of(datum: Datum) -> int:
 
 
 def _middle_deg(code: int) -> float:
-    """Return the longitude of the middle of a zone."""
     return 6.0 * (code % 100) - 183.0
 
 

@@ -105,7 +105,6 @@ def _add_frame(
     images: Sequence[pycolmap.Image],
     renamed: _Renamed,
 ) -> None:
-    """Add a posed frame of a second model with its images."""
     copies = [
         pycolmap.Image(
             name=bytes_of_name(name_of(image)),

@@ -179,7 +179,6 @@ def _with_positions(label: str, model: ColmapModel) -> ColmapModel:
 
 
 def _posed_model(label: str, model: ColmapModel) -> ColmapModel:
-    """Return a model of which `images` are those with a pose."""
     every, arrays = model.images, model.arrays
     has_pose = arrays.frames.is_posed[arrays.images.frame_of[arrays.images.rows(every.ids)]]
     images = every.part(np.flatnonzero(has_pose))

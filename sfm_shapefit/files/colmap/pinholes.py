@@ -142,7 +142,6 @@ def _maps_of(camera: pycolmap.Camera, pinhole: Pinhole) -> Maps:
 
 
 def _lies_inside(camera: pycolmap.Camera, pinhole: Pinhole) -> bool:
-    """Return whether the border of a picture comes from inside that of a camera."""
     width, height = pinhole.camera.width, pinhole.camera.height
     x, y = np.arange(width), np.arange(height)
     across, along = np.r_[x, x, 0 * y, 0 * y + width - 1], np.r_[0 * x, 0 * x + height - 1, y, y]

@@ -94,8 +94,6 @@ class PositionTable(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """What the columns of a table are."""
-
     roles: Sequence[str]
     """By column: name, an axis as in `_AXES`, or the axes of a sigma, cov or ref; ? or empty for others."""
     axes: Sequence[str]
@@ -187,7 +185,6 @@ def _role_of(word: str) -> str:
 
 
 def _words(word: str) -> list[str]:
-    """Return the words of a column's name, in small letters."""
     found: list[str] = []
     for one in map(str.lower, _WORD.findall(word)):
         fused = _FUSED.fullmatch(one)

@@ -321,7 +321,6 @@ def _read_images(files: ModelFiles, camera_ids: set[int]) -> _Images:
 
 
 def _read_rigs(files: ModelFiles, camera_ids: set[int]) -> dict[int, RigRecord]:
-    """Read rigs.bin; rigs by their ids."""
     file, rigs = files.open("rigs"), dict[int, RigRecord]()
     for _ in range(file.take_count(RIG.size, "rigs")):
         rig_id, num_sensors = map(int, file.take(RIG, "a rig"))
@@ -484,7 +483,6 @@ def _observe(model: ModelArrays, heads: Records, places: IntArray) -> tuple[int,
 
 
 def _ascending(points: Records, tracks: UInt32Array) -> tuple[Records, UInt32Array]:
-    """Return points by their ids, with their tracks."""
     order = np.argsort(points["id"], kind="stable")
     if (np.diff(order) == 1).all():
         return points, tracks
@@ -496,7 +494,6 @@ def _ascending(points: Records, tracks: UInt32Array) -> tuple[Records, UInt32Arr
 
 
 def _refuse_unknown_points(files: ModelFiles, model: ModelArrays) -> None:
-    """Refuse observations of points that are not there."""
     ids, point_ids = model.points2d["point3d_id"], np.append(model.points["id"], NO_POINT)
     for begin in range(0, len(ids), model_arrays.AT_ONCE):
         some = ids[begin : begin + model_arrays.AT_ONCE]
@@ -512,7 +509,6 @@ def _refuse_unknown_points(files: ModelFiles, model: ModelArrays) -> None:
 
 @inner_kernel
 def _read_u64(data: npt.NDArray[np.uint8], offset: int) -> np.uint64:
-    """Return the little-endian uint64 at `offset`."""
     value = np.uint64(0)
     for k in range(8):
         value |= np.uint64(data[offset + k]) << np.uint64(8 * k)

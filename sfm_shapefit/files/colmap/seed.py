@@ -176,7 +176,6 @@ class SeededModel:
         return heads
 
     def _blocks(self) -> Iterator[tuple[Records, UInt32Array]]:
-        """Yield points and their tracks, some at a time."""
         points = self.points
         for first in range(0, points.num_points, AT_ONCE):
             rows = np.arange(first, min(first + AT_ONCE, points.num_points))
