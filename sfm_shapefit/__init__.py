@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.graph.viewgraph import ViewGraph
     from sfm_shapefit.judgement.options import TrustOptions
     from sfm_shapefit.pairs.options import DirectionOptions
-    from sfm_shapefit.pipeline.adjust import AdjustedModel, bundle_adjust
+    from sfm_shapefit.pipeline.bundle_adjust import AdjustedModel, bundle_adjust
     from sfm_shapefit.pipeline.check import check, check_pieces
     from sfm_shapefit.pipeline.convert import convert
     from sfm_shapefit.pipeline.drop_in import average_database, global_mapping
@@ -75,7 +75,7 @@ _HOMES = {
     "files.colmap.quiet": ("hear_pycolmap",),
     "files.options": ("MatchingOptions",),
     "adjustment.options": ("AdjustmentOptions",),
-    "pipeline.adjust": ("AdjustedModel", "bundle_adjust"),
+    "pipeline.bundle_adjust": ("AdjustedModel", "bundle_adjust"),
     "pipeline.check": ("check", "check_pieces"),
     "pipeline.referee": ("CheckResult",),
     "pipeline.convert": ("convert",),

@@ -26,7 +26,7 @@ from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
 from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
-from sfm_shapefit.pipeline.inputs import inputs_from, read_left_out, settle_intrinsics
+from sfm_shapefit.pipeline.inputs import choose_intrinsics, inputs_from, read_left_out
 from sfm_shapefit.pipeline.known import between_images, read_known
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
@@ -74,7 +74,7 @@ def start_run(
             raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
         inputs = read_left_out(inputs_from(path), images.names, options.directions.without)
         matches = DatabaseMatches(file, images.names)
-        images, intrinsics = settle_intrinsics(images, matches, options.freedom.intrinsics, inputs.left_out)
+        images, intrinsics = choose_intrinsics(images, matches, options.freedom.intrinsics, inputs.left_out)
         gauge = between_images(options.gauge, images.names, "the database has no image")
         known = read_known(images, file, priors, options.gauge.control_points, options.averaging.gravity)
     return MapContext(

@@ -227,7 +227,7 @@ _UNLIKE = 1.1  # factor; pairs that agree scatter by a third of that
 _MOST_OFF = 4.0  # factor; a view graph that wants a larger one says more of itself than of the lens
 
 
-def settle_intrinsics(
+def choose_intrinsics(
     images: Images,
     matches: DatabaseMatches | TrackMatches,
     wanted: IntrinsicsFreedom,

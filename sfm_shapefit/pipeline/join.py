@@ -17,9 +17,9 @@ from sfm_shapefit.facts.options import JoinOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model, renamed_as
-from sfm_shapefit.pipeline.adjust import bundle_adjust
+from sfm_shapefit.pipeline.bundle_adjust import bundle_adjust
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
-from sfm_shapefit.pipeline.joining import JoinInputs, judge_joins, merge_groups, tell_group
+from sfm_shapefit.pipeline.model_joins import JoinInputs, judge_joins, merge_groups, tell_group
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 
 if TYPE_CHECKING:

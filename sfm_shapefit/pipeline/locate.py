@@ -23,10 +23,10 @@ from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
 from sfm_shapefit.pipeline.inputs import (
     RunInputs,
     choose_inputs,
+    choose_intrinsics,
     open_matches,
     read_left_out,
     see_matches,
-    settle_intrinsics,
 )
 from sfm_shapefit.pipeline.known import between_images, pull_of_rotations, read_fixed_images, read_known
 from sfm_shapefit.pipeline.memory import see_within_limit
@@ -95,7 +95,7 @@ def locate(
             opened, inputs = open_matches(model, inputs)
             matches = stack.enter_context(closing(opened))
             wanted = options.freedom.intrinsics
-            images, intrinsics = settle_intrinsics(given, matches, wanted, inputs.left_out, listed)
+            images, intrinsics = choose_intrinsics(given, matches, wanted, inputs.left_out, listed)
             known = read_known(images, matches.file, priors, options.gauge.control_points)
             fixed = read_fixed_images(model, options.fix)
             has_database = matches.file is not None

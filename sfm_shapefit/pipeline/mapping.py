@@ -25,8 +25,8 @@ from sfm_shapefit.pipeline.inputs import (
     RunInputs,
     see_matches,
 )
-from sfm_shapefit.pipeline.joining import JoinInputs, judge_joins, merge_groups, tell_group
 from sfm_shapefit.pipeline.memory import see_within_limit
+from sfm_shapefit.pipeline.model_joins import JoinInputs, judge_joins, merge_groups, tell_group
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.remedies import at_one_center, make_model
 from sfm_shapefit.pipeline.starts import adjust_first_placement
@@ -94,7 +94,7 @@ def locate_components(
 def _rigid_models(component: MappedModel, least: int) -> Iterator[MappedModel]:
     """Yield the model of a component, and those of its further rigid pieces with so many cameras.
 
-    The pairs between them tell no scale, but a join may, and `locate` of one cannot.
+    Pairs between two pieces tell no scale; a join of the two models may.
     """
     first = component.located
     large = [piece for piece in first.further if int(piece.kept.sum()) >= least]

@@ -47,14 +47,14 @@ _ADVICE = {
 
 
 class MeasureRequest(NamedTuple):
-    """What a pass over the matches is to tell beside the directions."""
+    """What a pass over the matches yields beside the directions."""
 
     tracks: PointNodes = "never"
-    """Whether tracks are joined; by "auto" those of many cameras only where their pairs do not hold them."""
+    """Whether tracks are joined; "auto" joins those of many cameras only where pairs do not hold them."""
     checked: bool = False
     errors: bool = False
     facts: bool = False
-    """Whether `MeasuredPairs.facts_per_match` is told."""
+    """Whether `MeasuredPairs.facts_per_match` is computed."""
 
 
 DIRECTIONS_ALONE = MeasureRequest()
@@ -125,7 +125,7 @@ def are_sampled(num_usable: int, num_pairs: int) -> bool:
 
 
 class _SideResults:
-    """What is made of each batch beside its directions."""
+    """Tracks, errors and counts that each batch adds to."""
 
     def __init__(self, source: MatchSource, threshold_px: float, wanted: MeasureRequest) -> None:
         view = source.view

@@ -18,7 +18,7 @@ from sfm_shapefit.judgement.verdicts import Hold, find_hold
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.pipeline.measure import add_evidence, build_graph
 from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged
-from sfm_shapefit.placement.place import Near, Placement, place_pieces
+from sfm_shapefit.placement.place import InitialPlacement, Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.solver.options import reported
@@ -49,7 +49,7 @@ def place_cameras(
     options: PlacementOptions,
     nodes: NodeOptions,
     clock: Clock,
-    near: Near | None = None,
+    near: InitialPlacement | None = None,
     *,
     certified: bool = True,
 ) -> Iterator[Placement]:

@@ -54,7 +54,7 @@ from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.conventions import ask_convention
-from sfm_shapefit.pipeline.evidence import ask_pixels, ask_shape, gather_evidence
+from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.pipeline.pictures import points_of_pictures

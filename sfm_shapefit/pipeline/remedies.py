@@ -39,7 +39,7 @@ class Remedy(NamedTuple):
     moved: tuple[str, ...]
     """Names of cameras whose pairs for this place are left out, as twice as many agree on another."""
 
-    def cures(self, after: LocateResult, before: LocateResult) -> bool:
+    def is_better(self, after: LocateResult, before: LocateResult) -> bool:
         """Return whether less speaks against a result than before, with lenses known and no camera lost."""
         less, images = _count(after) < _count(before), after.images
         open_ = after.intrinsics.undetermined[list(self.freed)].any()
@@ -74,7 +74,7 @@ def make_model(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateRe
         notes, result = (result,), _run(inputs, source, clock)
     for remedy in find_remedies(result, inputs, source):
         again = _run(remedy.inputs, remedy.source, clock)
-        if remedy.cures(again, result):
+        if remedy.is_better(again, result):
             result = remedy.applied(again)
             break
     return replace(result, warnings=(*notes, *result.warnings))

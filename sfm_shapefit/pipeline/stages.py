@@ -10,8 +10,8 @@
     examine_model        evidence that the fit did not use
     finish_model         `finish`: the result
 
-Each rigid piece goes through all stages after `place_rigid_pieces`. A further piece has a unit of its own:
-nothing that is known of positions says how large it is, and where.
+Each rigid piece goes through all stages after `place_rigid_pieces`. A further piece has an arbitrary
+scale: nothing that is known of positions says how large it is, and where it stands.
 """
 
 from dataclasses import replace
@@ -27,9 +27,9 @@ from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.doubted import confirm_cameras
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
-from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_cameras, with_uncertainty
+from sfm_shapefit.pipeline.camera_adjustment import adjust_placed, pull_cameras, with_uncertainty
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
-from sfm_shapefit.pipeline.evidence import confirm_by_pixels, open_beyond_noise, question, shape_of
+from sfm_shapefit.pipeline.examination import confirm_by_pixels, open_beyond_noise, question, shape_of
 from sfm_shapefit.pipeline.finish import finish_model
 from sfm_shapefit.pipeline.gauge_choice import bring_to_gauge, bring_to_known
 from sfm_shapefit.pipeline.measure import MeasureRequest, build_graph, measure, wants_points
@@ -141,7 +141,8 @@ def judge_piece(state: ModelState, clock: Clock) -> ModelState:
 def _with_known_errors(judged: Judged, state: ModelState) -> Judged:
     """Return the piece with the errors of the last adjustment, of the first placement if there is no other.
 
-    That knows nothing of a piece fewer than two of whose cameras had places then, or all of them the same.
+    The first placement knows no errors of a piece of which it has fewer than two cameras, or all at one
+    place.
     """
     images = state.source.images
     if state.adjustment is not None:

@@ -36,7 +36,7 @@ from sfm_shapefit.pipeline.placing import place_first
 from sfm_shapefit.pipeline.relative_rotations import estimate_here
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
-from sfm_shapefit.placement.place import Near
+from sfm_shapefit.placement.place import InitialPlacement
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.scene.images import Images
@@ -105,7 +105,7 @@ def adjust_first_placement(
         source=source,
         rigid=find_fixed_and_rigged(source.images),
         intrinsics=intrinsics,
-        near=Near(centers, placement.refined),
+        near=InitialPlacement(centers, placement.refined),
         first=adjusted,
     )
 

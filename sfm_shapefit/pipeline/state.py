@@ -25,7 +25,7 @@ from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
 from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged, find_fixed_and_rigged
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.gauge_rule import GaugeRule
-from sfm_shapefit.placement.place import Near, Placement
+from sfm_shapefit.placement.place import InitialPlacement, Placement
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.matches import is_among
@@ -46,7 +46,7 @@ class ModelState:
     rigid: FixedAndRigged
     intrinsics: RefinedIntrinsics
     """What may still change of lenses in doubt, and what became of them so far."""
-    near: Near | None = None
+    near: InitialPlacement | None = None
     """Where the adjustment of a first placement has the images."""
     first: Estimate | None = None
     """How a first placement was adjusted."""

@@ -97,8 +97,8 @@ class SolverOptions(Settings):
     )
     tol: float = option(
         1e-8,
-        "Certified gap, objective - dual_bound, at which a solve counts as converged. Left as it is, it is "
-        "1e-6 for a placement of more than a million pairs.",
+        "Certified gap, objective - dual_bound, at which a solve counts as converged. Placements of more "
+        "than a million pairs take 1e-6 unless another value is given.",
     )
     max_iterations: int | None = option(
         None,

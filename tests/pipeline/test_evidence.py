@@ -13,7 +13,7 @@ from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pipeline import evidence
+from sfm_shapefit.pipeline import examination as evidence
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.inputs import inputs_from, open_source
 from sfm_shapefit.pipeline.referee import check_source

@@ -22,13 +22,13 @@ from sfm_shapefit.files.colmap.listed_poses import read_list
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import template_of
-from sfm_shapefit.pipeline import adjustment as adjustment_stage
+from sfm_shapefit.pipeline import camera_adjustment as adjustment_stage
 from sfm_shapefit.pipeline import doubts as doubts_stage
 from sfm_shapefit.pipeline import measure as measure_stage
 from sfm_shapefit.pipeline import placing as rigs_stage
 from sfm_shapefit.pipeline.convert import convert
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.joining import judge_joins
+from sfm_shapefit.pipeline.model_joins import judge_joins
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged

@@ -125,9 +125,9 @@ def _measure_again(
     options: DirectionOptions,
     clock: Clock,
 ) -> PairDirections:
-    """Return the usable directions as they are at other rotations; the others, and what is said, stay.
+    """Return directions with the usable ones measured at other rotations; unusable ones stay as they are.
 
-    Images whose rotations were clearly wrong, and are `corrected`, get what their matches say now.
+    The other columns stay, too, but for pairs of `corrected` images, whose rotations were clearly wrong.
     """
     usable = earlier.usable()
     used = earlier.pairs[usable]

@@ -18,7 +18,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
-from sfm_shapefit.facts.joined import JoinedGroup, joined_camera_rows, joined_verdict
+from sfm_shapefit.facts.joined_cameras import JoinedGroup, joined_camera_rows, joined_verdict
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.model import EarthDatum, JoinedFacts
@@ -250,8 +250,8 @@ def _choose_scale(
 ) -> tuple[Gauge, JoinedGroup]:
     """Return the gauge of joined models, and the models in it.
 
-    A scale that the first model knows stays. An arbitrary one gives way to known distances, be they within
-    one of the models or between two.
+    A scale that the first model knows stays. An arbitrary scale gives way to known distances, within a model
+    or between two.
     """
     number = next(iter(group.world_from))
     placed = {name_of(image): image for image in group.reconstruction.images.values() if image.has_pose}
