@@ -1,9 +1,10 @@
 """What `check` says of several models of one set of images: each one's grade, and which to keep."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 
@@ -31,6 +32,12 @@ class CheckedPiece(Record):
     error: Annotated[str, "Why it cannot be read; empty if it can."] = ""
     facts: Annotated[CheckedFacts | None, "What check says of it alone; null if it cannot be read."] = None
 
+    @classmethod
+    def of_model(cls, folder: str, images: Images, facts: CheckedFacts) -> Self:
+        """Return a model in a folder, of some images, with what `check` says of it."""
+        widths = _focal_widths(images)
+        return cls(folder=folder, focal_widths=(float(widths.min()), float(widths.max())), facts=facts)
+
     @property
     def cells(self) -> tuple[str, ...]:
         """What the table says of it."""
@@ -48,6 +55,13 @@ class CheckedPieces(Record, Displayed, repr=False):
 
     pieces: Annotated[tuple[CheckedPiece, ...], "The models, in the order of their numbers."]
     contradictions: Annotated[tuple[str, ...], "What of them contradicts, or says the same, a sentence each."]
+
+    @classmethod
+    def compare(cls, pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -> Self:
+        """Return which models to keep, and where they contradict one another; `images` are by the folder."""
+        keep = set(_choose_kept(pieces, images))
+        kept = tuple(replace(one, keep=one.folder in keep) for one in pieces)
+        return cls(pieces=kept, contradictions=(*_compare_lenses(images), *_shared_images(images)))
 
     @property
     def kept(self) -> list[tuple[str, CheckedFacts]]:
@@ -70,12 +84,12 @@ class CheckedPieces(Record, Displayed, repr=False):
         return Telling(lines, rows, elsewhere="see --json", step=first)
 
 
-def focal_widths(images: Images) -> FloatArray:
+def _focal_widths(images: Images) -> FloatArray:
     """Return the focal length of each image over the longer side of its picture, (i,)."""
     return np.asarray(images.focal_lengths_px / images.sizes_px.max(axis=1))
 
 
-def choose_kept(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -> Iterator[str]:
+def _choose_kept(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -> Iterator[str]:
     """Yield the folders of the models to keep."""
     usable = [p for p in pieces if p.facts and p.facts.verdict.grade in (Grade.GOOD, Grade.LOOK)]
     taken = set[str]()
@@ -86,16 +100,16 @@ def choose_kept(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) ->
             yield one.folder
 
 
-def compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
+def _compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
     """Yield where models disagree on the focal length of one device."""
     names = [name for one in images.values() for name in one.names]
-    widths = np.concatenate([focal_widths(one) for one in images.values()])
+    widths = np.concatenate([_focal_widths(one) for one in images.values()])
     model = np.repeat(np.arange(len(images)), [one.num_images for one in images.values()])
     for rows, _ in find_sequences(names):
-        there = np.unique(model[rows])
-        typical = np.array([np.median(widths[rows][model[rows] == k]) for k in there])
+        members = np.unique(model[rows])
+        typical = np.array([np.median(widths[rows][model[rows] == k]) for k in members])
         if np.ptp(np.log(typical)) > FEW:
-            least, most = (Path([*images][there[k]]).name for k in (typical.argmin(), typical.argmax()))
+            least, most = (Path([*images][members[k]]).name for k in (typical.argmin(), typical.argmax()))
             yield (
                 f"one device, as {names[rows[0]]} and others say, has a focal length of {typical.min():.3g} "
                 f"picture widths in {least} and of {typical.max():.3g} in {most}: give its images one camera "
@@ -103,7 +117,7 @@ def compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
             )
 
 
-def shared_images(images: Mapping[str, Images]) -> Iterator[str]:
+def _shared_images(images: Mapping[str, Images]) -> Iterator[str]:
     """Yield which models have images in common."""
     for (one, mine), (other, others) in combinations(images.items(), 2):
         if common := len(set(mine.names) & set(others.names)):

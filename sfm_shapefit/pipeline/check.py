@@ -11,10 +11,6 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.checked_pieces import (
     CheckedPiece,
     CheckedPieces,
-    choose_kept,
-    compare_lenses,
-    focal_widths,
-    shared_images,
 )
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.options import MapOptions
@@ -27,7 +23,7 @@ from sfm_shapefit.judgement.evidence import fit_pairs
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.map import map_database, map_opened
-from sfm_shapefit.pipeline.pictures import AskedPictures, match_pictures
+from sfm_shapefit.pipeline.pictures import match_pictures
 from sfm_shapefit.pipeline.referee import CheckResult, OtherModel, check_source
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
@@ -65,14 +61,13 @@ def check(
     clock = Clock.of(progress)
     with clock("read"):
         inputs = choose_inputs(model, database)
-        request = None
-        if images is not None and inputs.database is None and max_minutes != 0.0:
-            request = AskedPictures(folder=Path(images), max_minutes=max_minutes)
-        posed = read_by_itself(model, with_lenses=True) if request else read_source(model, database)[0]
+        has_pictures = images is not None and inputs.database is None and max_minutes != 0.0
+        posed = read_by_itself(model, with_lenses=True) if has_pictures else read_source(model, database)[0]
     other = None
     with ExitStack() as stack:
-        if request is not None:
-            inputs = replace(stack.enter_context(match_pictures(posed, request, clock)), folder=inputs.folder)
+        if images is not None and has_pictures:
+            made = stack.enter_context(match_pictures(posed, Path(images), max_minutes, clock))
+            inputs = replace(made, folder=inputs.folder)
         source = stack.enter_context(open_source(posed, inputs))
         if second_opinion and isinstance(source.matches, DatabaseMatches):
             file = source.matches.file
@@ -148,13 +143,7 @@ def check_pieces(
             pieces.append(CheckedPiece(folder=name, error=str(error)))
             continue
         images[name] = checked.model.images
-        widths = focal_widths(images[name])
-        lenses = (float(widths.min()), float(widths.max()))
-        pieces.append(CheckedPiece(folder=name, focal_widths=lenses, facts=checked.facts))
+        pieces.append(CheckedPiece.of_model(name, images[name], checked.facts))
     if not images:
         raise InputError(f"{folder} holds no COLMAP model that can be read; {pieces[0].error}")
-    keep = set(choose_kept(pieces, images))
-    pieces = [replace(one, keep=one.folder in keep) for one in pieces]
-    return CheckedPieces(
-        pieces=tuple(pieces), contradictions=(*compare_lenses(images), *shared_images(images))
-    )
+    return CheckedPieces.compare(pieces, images)

@@ -1,10 +1,10 @@
 """`join`: models of one scene in one world, by one convex program.
 
-models and matches -> ties between pieces -> joins (`joining`) -> adjusted -> judged as `check` does
+models and matches -> ties between pieces -> joins (`model_joins`) -> adjusted -> judged as `check` does
 """
 
-from collections.abc import Collection, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,11 +16,11 @@ from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.options import JoinOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import open_database
-from sfm_shapefit.files.colmap.model import read_model, renamed_as
+from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.bundle_adjust import bundle_adjust
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.pipeline.model_joins import JoinInputs, judge_joins, merge_groups, tell_group
-from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
+from sfm_shapefit.pipeline.pieces import ModelPiece, missing_images, read_pieces, tie_pieces
 
 if TYPE_CHECKING:
     import pycolmap
@@ -62,7 +62,7 @@ def join(
         if isinstance(models, Path | str) or len(models) < 2:
             raise InputError("a join needs two models or more; give their folders one after the other")
         inputs = choose_inputs(models[0], database)
-        pieces = _read(models, inputs.database)
+        pieces = read_pieces(models, inputs.database)
         names = sorted({name for piece in pieces for name in piece.model.images.names})
         shares = len(names) < sum(piece.model.images.num_images for piece in pieces)
         if inputs.database is None or (shares and database is None):
@@ -94,49 +94,13 @@ def join(
         return tell_group(group, join_inputs, source, options.directions, clock)
 
 
-def _read(
-    models: "Sequence[pycolmap.Reconstruction | Path | str]", database: Path | None
-) -> list[ModelPiece]:
-    """Read the models, and refuse those that have nothing to join."""
-    pieces: list[ModelPiece] = []
-    read_models = [*map(read_model, models)]
-    every = {name for model in read_models for name in model.images.names}
-    # A database that has all of them, each under its own name, says that they are different images.
-    are_different = False
-    with suppress(InputError):  # what is wrong with a database is said where it is opened for its matches
-        are_different = database is not None and not _missing(database, every)
-    for number, (source, model) in enumerate(zip(models, read_models, strict=True)):
-        label = str(source) if isinstance(source, Path | str) else f"model {number}"
-        names = dict.fromkeys(name for piece in pieces for name in piece.model.images.names)
-        piece = ModelPiece(label=label, model=model if are_different else renamed_as(model, list(names)))
-        for earlier in pieces:
-            if {*piece.model.images.names} <= {*earlier.model.images.names}:
-                raise InputError(
-                    f"every image of {label} is in {earlier.label} too, so that there is nothing to join; "
-                    "leave out one of them"
-                )
-        pieces.append(piece)
-    rigs = [piece.model.images.has_rigs for piece in pieces]
-    if any(rigs) and not all(rigs):
-        raise InputError(
-            f"{pieces[rigs.index(True)].label} has rigs of several cameras, and a scale by that, but "
-            f"{pieces[rigs.index(False)].label} has none; give both the same rigs"
-        )
-    return [replace(piece, scale_sigma=0.0) for piece in pieces] if any(rigs) else pieces
-
-
-def _missing(database: Path, names: Collection[str]) -> tuple[str, ...]:
-    with closing(open_database(database, sorted(names))) as matches:
-        return matches.missing_names
-
-
 def _without_foreign(inputs: Inputs, names: Sequence[str]) -> Inputs:
     """Return the inputs without a database that was only found, and is that of the first model alone."""
     shared, path = "images that the models share", inputs.database
     if path is None:
         return replace(inputs, statement=shared)
     try:
-        missing = _missing(path, names)
+        missing = missing_images(path, names)
     except InputError as error:
         return replace(inputs, database=None, statement=f"{shared}; the database beside the first: {error}")
     if not missing:

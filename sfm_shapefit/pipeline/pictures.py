@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -36,33 +35,27 @@ from sfm_shapefit.tracks.options import StructureOptions
 _FOR_FEATURES = 0.6  # share of the minutes; features take half of the time where there is no limit
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskedPictures:
-    """Pictures of a model, and the minutes that asking them may take."""
-
-    folder: Path
-    max_minutes: float | None = None
-
-
 @contextmanager
-def match_pictures(model: ColmapModel, request: AskedPictures, clock: Clock) -> Iterator[Inputs]:
-    """Yield the inputs that a model's pictures make: a database, which is gone afterwards.
+def match_pictures(
+    model: ColmapModel, folder: Path, max_minutes: float | None, clock: Clock
+) -> Iterator[Inputs]:
+    """Yield the inputs that a model's pictures in a folder make: a database, which is gone afterwards.
 
     Raises:
         InputError: if fewer than two pictures can be read.
     """
-    refuse_no_folder(request.folder)
-    began, minutes = time.monotonic(), np.inf if request.max_minutes is None else request.max_minutes
+    refuse_no_folder(folder)
+    began, minutes = time.monotonic(), np.inf if max_minutes is None else max_minutes
     with TemporaryDirectory(prefix="shapefit-") as scratch:
         path = Path(scratch) / "database.db"
         pictures = PictureMatches(model=model, database=path, threads=clock.threads)
         with clock("features"):
             states = pictures.detect(
-                request.folder,
+                folder,
                 lambda: time.monotonic() > began + 60.0 * _FOR_FEATURES * minutes,
                 clock.advance,
             )
-        _refuse_no_pictures(request.folder, model.images.names, states)
+        _refuse_no_pictures(folder, model.images.names, states)
         tracks = TrackMatches(model)
         shared = Shared(tracks.pairs, tracks.num_matches)
         chosen = choose_pairs(
@@ -73,10 +66,10 @@ def match_pictures(model: ColmapModel, request: AskedPictures, clock: Clock) -> 
                 chosen.pairs, lambda: time.monotonic() > began + 60.0 * minutes, clock.advance
             )
         pictures.name_images()
-        statement = _state(request.folder, states, chosen.reasons, count)
+        statement = _state(folder, states, chosen.reasons, count)
         rows, names = chosen.pairs[~chosen.is_near].tolist(), model.images.names
         far = frozenset((min(names[i], names[j]), max(names[i], names[j])) for i, j in rows)
-        yield Inputs(folder=None, database=path, statement=statement, images=request.folder, far=far)
+        yield Inputs(folder=None, database=path, statement=statement, images=folder, far=far)
 
 
 def _refuse_no_pictures(folder: Path, names: Sequence[str], states: Sequence[str]) -> None:

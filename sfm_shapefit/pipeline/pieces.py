@@ -1,18 +1,25 @@
 """Models as pieces: their cameras, and what ties those of two: matches of a database, and images of both."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import METRIC_SIGMA, normalized
-from sfm_shapefit.files.colmap.model import ColmapModel
+from sfm_shapefit.files.colmap.database import open_database
+from sfm_shapefit.files.colmap.model import ColmapModel, read_model, renamed_as
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of
 from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import Matches, PairNames, RayMatches
+
+if TYPE_CHECKING:
+    import pycolmap
 
 _LEAST_MATCHES = 10  # matches of a pair; fewer tell no direction, and would be taken for one by chance
 _SAME_PIXEL = 0.5  # pixels; keypoints of a model and of a database that are no farther apart are one
@@ -53,6 +60,43 @@ class _Tie(NamedTuple):
     """(m, 2)"""
     pixel_angle: float
     is_shared: bool
+
+
+def read_pieces(
+    models: "Sequence[pycolmap.Reconstruction | Path | str]", database: Path | None
+) -> list[ModelPiece]:
+    """Read the models, and refuse those that have nothing to join."""
+    pieces: list[ModelPiece] = []
+    read_models = [*map(read_model, models)]
+    every = {name for model in read_models for name in model.images.names}
+    # A database that has all of them, each under its own name, says that they are different images.
+    are_different = False
+    with suppress(InputError):  # what is wrong with a database is said where it is opened for its matches
+        are_different = database is not None and not missing_images(database, every)
+    for number, (source, model) in enumerate(zip(models, read_models, strict=True)):
+        label = str(source) if isinstance(source, Path | str) else f"model {number}"
+        names = dict.fromkeys(name for piece in pieces for name in piece.model.images.names)
+        piece = ModelPiece(label=label, model=model if are_different else renamed_as(model, list(names)))
+        for earlier in pieces:
+            if {*piece.model.images.names} <= {*earlier.model.images.names}:
+                raise InputError(
+                    f"every image of {label} is in {earlier.label} too, so that there is nothing to join; "
+                    "leave out one of them"
+                )
+        pieces.append(piece)
+    rigs = [piece.model.images.has_rigs for piece in pieces]
+    if any(rigs) and not all(rigs):
+        raise InputError(
+            f"{pieces[rigs.index(True)].label} has rigs of several cameras, and a scale by that, but "
+            f"{pieces[rigs.index(False)].label} has none; give both the same rigs"
+        )
+    return [replace(piece, scale_sigma=0.0) for piece in pieces] if any(rigs) else pieces
+
+
+def missing_images(database: Path, names: Collection[str]) -> tuple[str, ...]:
+    """Return the names of images that a database lacks."""
+    with closing(open_database(database, sorted(names))) as matches:
+        return matches.missing_names
 
 
 def tie_pieces(pieces: Sequence[ModelPiece], matches: Matches | None, left_out: PairNames) -> TiedPieces:

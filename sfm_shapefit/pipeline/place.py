@@ -73,9 +73,7 @@ def place(
     threads = options.solver.num_threads()
     if isinstance(measured, Path | str):
         poses = read_pose_graph(measured)
-        measured = (
-            read_graph(measured) if poses is None else orient_pose_graph(poses, None, threads=threads)[0]
-        )
+        measured = orient_pose_graph(poses, threads=threads)[0] if poses else read_graph(measured)
     graph = MeasuredGraph(measured) if isinstance(measured, ViewGraph) else measured
     if sigma is not None:
         graph = replace(graph, covariance=direction_covariances(graph.graph, sigma))

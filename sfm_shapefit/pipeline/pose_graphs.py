@@ -36,7 +36,7 @@ def read_pose_graph(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeomet
 
 def orient_pose_graph(
     poses: EpipolarGeometries,
-    path: Path | str | None,
+    path: Path | str | None = None,
     max_rotation_error_deg: float = MAX_ROTATION_ERROR_DEG,
     *,
     threads: int,
