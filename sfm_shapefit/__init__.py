@@ -122,7 +122,7 @@ _HOMES = {
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __version__ = "0.1.0"
-__all__ = sorted(_HOME_OF)
+__all__ = list(_HOME_OF)
 
 _write_by(lambda: _import_module("sfm_shapefit.pipeline.write").WRITERS)
 

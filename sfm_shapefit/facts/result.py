@@ -48,12 +48,7 @@ from sfm_shapefit.facts.scene import Loop, told_distances
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.grade import (
-    Shares,
-    judge_model,
-    too_few_to_judge,
-    weigh_evidence,
-)
+from sfm_shapefit.judgement.grade import Shares, judge_model, too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_each, of_model

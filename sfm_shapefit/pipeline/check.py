@@ -8,10 +8,7 @@ import numpy as np
 
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.facts.checked_pieces import (
-    CheckedPiece,
-    CheckedPieces,
-)
+from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database

@@ -9,12 +9,7 @@ from sfm_shapefit.files.colmap.listed_poses import is_list, read_by_itself
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.priors import in_meters, read_positions
 from sfm_shapefit.files.listed_names import named_as
-from sfm_shapefit.scene.evaluation import (
-    Evaluation,
-    PositionEvaluation,
-    evaluate_poses,
-    evaluate_positions,
-)
+from sfm_shapefit.scene.evaluation import Evaluation, PositionEvaluation, evaluate_poses, evaluate_positions
 from sfm_shapefit.scene.pose_errors import NamedPoses
 
 

@@ -20,11 +20,7 @@ from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import MapContext, pairs_among
-from sfm_shapefit.pipeline.inputs import (
-    MatchSource,
-    RunInputs,
-    see_matches,
-)
+from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, see_matches
 from sfm_shapefit.pipeline.memory import see_within_limit
 from sfm_shapefit.pipeline.model_joins import JoinInputs, judge_joins, merge_groups, tell_group
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces

@@ -9,9 +9,7 @@ The limit is looked at twice before anything is solved: with the counts of the d
 known. What can be given up is listed in `MEMORY_PLANS`, the cheapest first; the first that fits is taken.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -21,7 +19,6 @@ from sfm_shapefit.facts.options import InspectOptions, PlacingOptions
 from sfm_shapefit.files.colmap.database import MOST_KEYPOINTS, PIXEL_BYTES
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
-from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import are_sampled
@@ -95,16 +92,17 @@ def choose_memory_plan(
 
 
 def keep_within_memory(
-    measured: MeasuredGraph, describe: Callable[[MeasuredGraph], Workload], limit_mb: int, least: MemoryPlan
+    measured: MeasuredGraph, work: Workload, options: PlacingOptions, least: MemoryPlan
 ) -> tuple[MemoryPlan, MeasuredGraph]:
-    """Return what is given up, `least` or more, to stay below a limit that is not 0, and the graph then.
+    """Return what is given up, `least` or more, to stay below the limit of memory, and the graph then.
 
-    `describe` returns the work that a graph makes.
+    `work` is all of it but for the graph.
     """
-    if not limit_mb:
+    if not options.memory.max_memory_mb:
         return least, measured
     bare = measured.without_points()
-    plan = choose_memory_plan(describe(measured), describe(bare), limit_mb, least)
+    full, less = (describe_work(graph, work, options.placement) for graph in (measured, bare))
+    plan = choose_memory_plan(full, less, options.memory.max_memory_mb, least)
     return plan, measured if plan.points else bare
 
 
@@ -216,12 +214,3 @@ def count_work(
         num_matches=int(directions.num_matches.sum()),
         num_sampled=num_usable if source.memory_plan.samples and are_sampled(num_usable, num_pairs) else 0,
     )
-
-
-def keep_within_limit(
-    graph: MeasuredGraph, source: MatchSource, measured: MeasuredPairs, options: PlacingOptions
-) -> tuple[MemoryPlan, MeasuredGraph]:
-    """Return what is given up to stay below the limit of memory, and the graph then."""
-    work = count_work(source, measured.directions, options)
-    describe = partial(describe_work, work=work, options=options.placement)
-    return keep_within_memory(graph, describe, options.memory.max_memory_mb, source.memory_plan)

@@ -33,7 +33,7 @@ from sfm_shapefit.pipeline.examination import confirm_by_pixels, open_beyond_noi
 from sfm_shapefit.pipeline.finish import finish_model
 from sfm_shapefit.pipeline.gauge_choice import bring_to_gauge, bring_to_known
 from sfm_shapefit.pipeline.measure import MeasureRequest, build_graph, measure, wants_points
-from sfm_shapefit.pipeline.memory import keep_within_limit
+from sfm_shapefit.pipeline.memory import count_work, keep_within_memory
 from sfm_shapefit.pipeline.placing import may_be_checked, place_cameras, place_measured
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
 from sfm_shapefit.pipeline.state import ModelState
@@ -76,7 +76,8 @@ def place_rigid_pieces(state: ModelState, clock: Clock) -> list[ModelState]:
     images, options, measured = state.source.images, state.inputs.options, state.measured
     with clock("solve"):
         graph = state.rigid.apply(build_graph(images, measured, options.nodes))
-        plan, graph = keep_within_limit(graph, state.source, measured, options)
+        work = count_work(state.source, measured.directions, options)
+        plan, graph = keep_within_memory(graph, work, options, state.source.memory_plan)
         measured = measured if plan.samples else replace(measured, errors=None)
         limited, nodes = plan.limit(options.placement), options.nodes
         place = partial(place_cameras, options=limited, nodes=nodes, clock=clock, near=state.near)

@@ -17,13 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
-from sfm_shapefit.base.geometry import (
-    METRIC_SIGMA,
-    Similarity,
-    compose,
-    fit_similarity,
-    principal_lengths,
-)
+from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose, fit_similarity, principal_lengths
 from sfm_shapefit.placement.gauge import Free, Gauge, fit_to_priors
 from sfm_shapefit.scene.given import (
     FEWEST_CONTROL_POINTS,

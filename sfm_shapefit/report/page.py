@@ -39,13 +39,7 @@ from sfm_shapefit.report.charts import (
 )
 from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, input_centers
 from sfm_shapefit.report.first_screen import banner, scene_name, tiles
-from sfm_shapefit.report.sentences import (
-    MAX_TEXT,
-    Hint,
-    first_looks,
-    shorten,
-    summary_sentences,
-)
+from sfm_shapefit.report.sentences import MAX_TEXT, Hint, first_looks, shorten, summary_sentences
 
 MAX_PAIRS = 20_000  # pairs that the page lists and draws; with more it opens slowly
 _HIGH_TRUST = 0.95  # trust; the chart of trust leaves out cameras above, which need no look

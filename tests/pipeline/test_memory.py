@@ -2,13 +2,13 @@
 
 import re
 from dataclasses import fields, replace
-from functools import partial
 
 import numpy as np
 import pytest
 
 import sfm_shapefit
 from sfm_shapefit import InputError
+from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -89,6 +89,11 @@ LOOP_WORK = Workload(
 )
 
 
+def limited_to(limit_mb, **options):
+    """Options with a limit of memory."""
+    return LocateOptions(max_memory_mb=int(limit_mb), **options)
+
+
 def describe(measured, work, options=PLACEMENT):
     """What there is to do with a graph."""
     return describe_work(measured, work, options)
@@ -108,8 +113,8 @@ def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it_and_then_n
     assert not full.needs_factor
     least = forecast(full, MEMORY_PLANS[-1]).peak_mb
     assert forecast(full, MEMORY_PLANS[-2]).peak_mb > least
-    of_split = partial(describe, work=LOOP_WORK, options=split)
-    economy, kept = keep_within_memory(plain, of_split, int(np.ceil(least)), MEMORY_PLANS[0])
+    limited = limited_to(np.ceil(least), solver="admm")
+    economy, kept = keep_within_memory(plain, LOOP_WORK, limited, MEMORY_PLANS[0])
     assert economy is MEMORY_PLANS[-1]
     assert kept is plain
     changed = economy.limit(split)
@@ -132,12 +137,10 @@ def test_points_that_are_given_up_are_in_the_graph_no_more():
         adjusts=True,
     )
     limit = forecast(describe(measured.without_points(), work), MEMORY_PLANS[3]).peak_mb
-    economy, kept = keep_within_memory(
-        measured, partial(describe, work=work), int(np.ceil(limit)), MEMORY_PLANS[0]
-    )
+    economy, kept = keep_within_memory(measured, work, limited_to(np.ceil(limit)), MEMORY_PLANS[0])
     assert not economy.points
     assert kept.num_points == 0
-    assert keep_within_memory(measured, partial(describe, work=work), 0, MEMORY_PLANS[0])[1] is measured
+    assert keep_within_memory(measured, work, limited_to(0), MEMORY_PLANS[0])[1] is measured
 
 
 def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_for():
@@ -152,12 +155,11 @@ def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_f
     assert forecast(asked, MEMORY_PLANS[-1]).peak_mb > 14 * 144
     measured = MeasuredGraph(loop_graph())
     last = [economy for economy in MEMORY_PLANS if economy.adjustment][-1]
-    of_crowded = partial(describe, work=crowded)
-    needed = forecast(of_crowded(measured), last).peak_mb
-    economy = keep_within_memory(measured, of_crowded, int(needed) - 1, MEMORY_PLANS[0])[0]
+    needed = forecast(describe(measured, crowded), last).peak_mb
+    economy = keep_within_memory(measured, crowded, limited_to(needed - 1), MEMORY_PLANS[0])[0]
     assert "not adjusted" in economy.statement
     assert not economy.adjustment
-    assert keep_within_memory(measured, of_crowded, 10**6, MEMORY_PLANS[0])[0].adjustment
+    assert keep_within_memory(measured, crowded, limited_to(10**6), MEMORY_PLANS[0])[0].adjustment
 
 
 @pytest.fixture(scope="module")

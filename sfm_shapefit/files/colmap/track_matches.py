@@ -12,14 +12,7 @@ from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
-from sfm_shapefit.scene.matches import (
-    PLENTY,
-    Matches,
-    PairNames,
-    Reading,
-    View,
-    batch_ranges,
-)
+from sfm_shapefit.scene.matches import PLENTY, Matches, PairNames, Reading, View, batch_ranges
 from sfm_shapefit.scene.points import Points
 
 
