@@ -40,7 +40,7 @@ def seed_points(state: ModelState, clock: Clock, confirmed: BoolArray | None = N
     """Move the kept cameras, triangulate points, and adjust both if asked for.
 
     Bundle adjustment is free to scale, shift and turn everything; the gauge is set after it. Half of the
-    points suffice for images (i,) that are `sure`, as the pixels confirm them.
+    points suffice for images (i,) that are `confirmed` by the pixels.
     """
     source, options, fixed = state.source, state.inputs.options, state.inputs.fixed_frames
     images, points, bundle, partners = _make_points(state, clock)

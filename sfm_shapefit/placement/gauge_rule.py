@@ -120,13 +120,15 @@ class GaugeRule(NamedTuple):
 def gauge_of_distances(names: Sequence[str], locations: FloatArray, known: Sequence[KnownDistance]) -> Gauge:
     """Return the gauge of known distances of cameras, by name; those that are not there say nothing."""
     place_of = {name: place for place, name in enumerate(names)}
-    there = [one for one in known if {*one[:2]} <= place_of.keys()]
-    if not there:
+    distances = [one for one in known if {*one[:2]} <= place_of.keys()]
+    if not distances:
         missing = next(name for name in known[0][:2] if name not in place_of)
         raise UnsolvableError(f"known distances: the image {missing} could not be placed; choose another")
-    places = np.array([[place_of[first], place_of[second]] for first, second, _ in there])
-    said = [f"{first} and {second}" for first, second, _ in there]
-    return distance_gauge(locations, places, np.array([float(distance) for *_, distance in there]), said)
+    places = np.array([[place_of[first], place_of[second]] for first, second, _ in distances])
+    clauses = [f"{first} and {second}" for first, second, _ in distances]
+    return distance_gauge(
+        locations, places, np.array([float(distance) for *_, distance in distances]), clauses
+    )
 
 
 def say_unused(what: str, chosen: Gauge, find: Callable[[], float]) -> str:

@@ -122,8 +122,8 @@ class AveragingSystem:
         """Factor the matrix of blocks (k, b, b); UnsolvableError if it is not positive definite."""
         b = blocks.shape[1]
         factor, diagonal = self._factor_of(b), self.sum_at_nodes(blocks)
-        own = diagonal[:, range(b), range(b)]
-        diagonal[:, range(b), range(b)] += RIDGE * own.mean()
+        entries = diagonal[:, range(b), range(b)]
+        diagonal[:, range(b), range(b)] += RIDGE * entries.mean()
         if not factor.refactor_blocks(self.pairs, diagonal, -blocks):
             raise UnsolvableError("the pairs do not determine the rotations to working precision")
 

@@ -410,11 +410,11 @@ def is_among(pairs: IntArray, others: IntArray) -> BoolArray:
 def rows_of_pairs(pairs: IntArray, others: IntArray) -> IntArray:
     """Return the row of each pair (k, 2) among others (m, 2), -1 for none, whatever the order of images."""
     size = 1 + max(int(pairs.max(initial=0)), int(others.max(initial=0)))
-    own, those = (np.sort(ends, axis=1) @ np.array([size, 1]) for ends in (pairs, others))
+    keys, those = (np.sort(ends, axis=1) @ np.array([size, 1]) for ends in (pairs, others))
     those = np.append(those, -1)  # which is none
     order = np.argsort(those, kind="stable")
-    rows = order[np.minimum(np.searchsorted(those, own, sorter=order), len(those) - 1)]
-    return np.asarray(np.where(those[rows] == own, rows, -1))
+    rows = order[np.minimum(np.searchsorted(those, keys, sorter=order), len(those) - 1)]
+    return np.asarray(np.where(those[rows] == keys, rows, -1))
 
 
 def indices_of_pairs(index: Mapping[str, int], pairs: PairNames) -> IntArray:

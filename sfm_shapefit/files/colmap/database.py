@@ -230,11 +230,11 @@ class DatabaseMatches(Matches):
 
     def _stored_matches(self, chosen: IntArray) -> bytes:
         """Return the matches of pairs as the file lists them, one pair after the other."""
-        found = self.look_up(chosen, "cols, data")
-        for pair, (cols, data) in zip(chosen.tolist(), found, strict=True):
+        stored = self.look_up(chosen, "cols, data")
+        for pair, (cols, data) in zip(chosen.tolist(), stored, strict=True):
             if cols != 2 or not is_blob(data, int(self.num_matches[pair]), 2, itemsize=4):
                 raise self.damaged_pair(pair, "matches of wrong length")
-        return b"".join(data for _, data in found)
+        return b"".join(data for _, data in stored)
 
     def parts(self, view: View, ranges: Sequence[slice]) -> "list[DatabasePart]":
         """Return ranges of a view's pairs for other processes."""

@@ -128,10 +128,10 @@ def _places(
             raise InputError(f"{path}: frame {frame_id} has image {image_id} at another camera's place")
         if known:
             members.setdefault(frame_id, []).append(image_id)
-    found: dict[int, InFrame] = {}
+    frame_of: dict[int, InFrame] = {}
     for frame_id, image_ids in members.items():
         cameras = [camera_of[i] for i in image_ids]
-        if len(set(cameras)) < len(cameras) or any(i in found for i in image_ids):
+        if len(set(cameras)) < len(cameras) or any(i in frame_of for i in image_ids):
             raise InputError(f"{path}: an image of frame {frame_id} stands twice; configure rigs again")
-        found |= {i: InFrame(rig_of_frame.get(frame_id, -1), min(image_ids)) for i in image_ids}
-    return found
+        frame_of |= {i: InFrame(rig_of_frame.get(frame_id, -1), min(image_ids)) for i in image_ids}
+    return frame_of

@@ -69,9 +69,9 @@ class SeededModel:
             keypoints: for matches of a database to refer to; None: those of the template.
         """
         keypoints = keypoints or (lambda _: None)
-        own = tuple(_narrowed(keypoints(k)) for k in range(images.num_images))
+        pixels = tuple(_narrowed(keypoints(k)) for k in range(images.num_images))
         colors, bare = np.zeros((points.num_points, 3), dtype=np.uint8), replace(template, colors=None)
-        seed = cls(template=bare, images=images, points=points, colors=colors, keypoints=own)
+        seed = cls(template=bare, images=images, points=points, colors=colors, keypoints=pixels)
         return replace(seed, colors=color_points(points, images.ids.tolist(), seed._pixels, template.colors))
 
     @cached_property
