@@ -113,7 +113,7 @@ def doubt_cameras(
     """Return the placement with a trust that follows what the pairs say of the rotations.
 
     What `ask_pairs` returned is `relative`; if None, the given rotations are believed. Pairs of a model's own
-    tracks hold no second scene, and say nothing of cameras (k,) that are `confirmed`; None: pairs of a database.
+    tracks hold no second scene, and say nothing of `confirmed` cameras (k,); None: pairs of a database.
     """
     if relative is None:
         return replace(placement, assessment=believe_rotations(placement.assessment))
