@@ -25,59 +25,69 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 from typing import Any as _Any
 
+from sfm_shapefit.base.display import write_by as _write_by
+
 if TYPE_CHECKING:
-    from sfm_shapefit.adjustment.options import AdjustmentOptions
-    from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
-    from sfm_shapefit.facts.map_result import JoinedModel, MapResult
-    from sfm_shapefit.facts.options import (
-        InspectOptions,
-        JoinOptions,
-        LocateOptions,
-        MapOptions,
-        SourceOptions,
-    )
-    from sfm_shapefit.facts.result import LocateResult
-    from sfm_shapefit.files.colmap.quiet import hear_pycolmap
-    from sfm_shapefit.files.options import MatchingOptions
-    from sfm_shapefit.graph.viewgraph import ViewGraph
-    from sfm_shapefit.judgement.options import TrustOptions
-    from sfm_shapefit.pairs.options import DirectionOptions
-    from sfm_shapefit.pipeline.adjust import AdjustedModel, bundle_adjust
-    from sfm_shapefit.pipeline.check import check
-    from sfm_shapefit.pipeline.check_pieces import check_pieces
-    from sfm_shapefit.pipeline.checked import CheckResult
-    from sfm_shapefit.pipeline.convert import convert
-    from sfm_shapefit.pipeline.drop_in import average_database, global_mapping
-    from sfm_shapefit.pipeline.evaluate import evaluate
-    from sfm_shapefit.pipeline.inspect import inspect
-    from sfm_shapefit.pipeline.join import join
-    from sfm_shapefit.pipeline.locate import locate
-    from sfm_shapefit.pipeline.map import map_database
-    from sfm_shapefit.pipeline.match import match_images
-    from sfm_shapefit.pipeline.place import place
-    from sfm_shapefit.pipeline.relative_rotations import relative_rotations
-    from sfm_shapefit.pipeline.workspace import Workspace, workspace
-    from sfm_shapefit.pipeline.write import WriteOptions, write_result
-    from sfm_shapefit.placement.options import GaugeOptions
-    from sfm_shapefit.placement.place import Placement
-    from sfm_shapefit.refinement.options import PlacementOptions
-    from sfm_shapefit.rotations.average import average_rotations
-    from sfm_shapefit.rotations.averaged import AveragedRotations
-    from sfm_shapefit.rotations.options import AveragingOptions
-    from sfm_shapefit.scene.freedom import FreedomOptions
-    from sfm_shapefit.solver.certificate import Certificate, certify
-    from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
-    from sfm_shapefit.solver.solve import solve
-    from sfm_shapefit.tracks.options import NodeOptions, StructureOptions
+    from sfm_shapefit.adjustment.options import AdjustmentOptions as AdjustmentOptions
+    from sfm_shapefit.base.errors import InputError as InputError
+    from sfm_shapefit.base.errors import ShapeFitError as ShapeFitError
+    from sfm_shapefit.base.errors import UnsolvableError as UnsolvableError
+    from sfm_shapefit.facts.map_result import JoinedModel as JoinedModel
+    from sfm_shapefit.facts.map_result import MapResult as MapResult
+    from sfm_shapefit.facts.options import InspectOptions as InspectOptions
+    from sfm_shapefit.facts.options import JoinOptions as JoinOptions
+    from sfm_shapefit.facts.options import LocateOptions as LocateOptions
+    from sfm_shapefit.facts.options import MapOptions as MapOptions
+    from sfm_shapefit.facts.options import SourceOptions as SourceOptions
+    from sfm_shapefit.facts.result import LocateResult as LocateResult
+    from sfm_shapefit.files.colmap.quiet import hear_pycolmap as hear_pycolmap
+    from sfm_shapefit.files.options import MatchingOptions as MatchingOptions
+    from sfm_shapefit.graph.viewgraph import ViewGraph as ViewGraph
+    from sfm_shapefit.judgement.options import TrustOptions as TrustOptions
+    from sfm_shapefit.pairs.options import DirectionOptions as DirectionOptions
+    from sfm_shapefit.pipeline.bundle_adjust import AdjustedModel as AdjustedModel
+    from sfm_shapefit.pipeline.bundle_adjust import bundle_adjust as bundle_adjust
+    from sfm_shapefit.pipeline.check import check as check
+    from sfm_shapefit.pipeline.check import check_pieces as check_pieces
+    from sfm_shapefit.pipeline.convert import convert as convert
+    from sfm_shapefit.pipeline.drop_in import average_database as average_database
+    from sfm_shapefit.pipeline.drop_in import global_mapping as global_mapping
+    from sfm_shapefit.pipeline.evaluate import evaluate as evaluate
+    from sfm_shapefit.pipeline.inspect import inspect as inspect
+    from sfm_shapefit.pipeline.join import join as join
+    from sfm_shapefit.pipeline.locate import locate as locate
+    from sfm_shapefit.pipeline.map import map_database as map_database
+    from sfm_shapefit.pipeline.match import match_images as match_images
+    from sfm_shapefit.pipeline.place import place as place
+    from sfm_shapefit.pipeline.referee import CheckResult as CheckResult
+    from sfm_shapefit.pipeline.relative_rotations import relative_rotations as relative_rotations
+    from sfm_shapefit.pipeline.workspace import Workspace as Workspace
+    from sfm_shapefit.pipeline.workspace import workspace as workspace
+    from sfm_shapefit.pipeline.write import WriteOptions as WriteOptions
+    from sfm_shapefit.pipeline.write import write_result as write_result
+    from sfm_shapefit.placement.options import GaugeOptions as GaugeOptions
+    from sfm_shapefit.placement.place import Placement as Placement
+    from sfm_shapefit.refinement.options import PlacementOptions as PlacementOptions
+    from sfm_shapefit.rotations.average import average_rotations as average_rotations
+    from sfm_shapefit.rotations.averaged import AveragedRotations as AveragedRotations
+    from sfm_shapefit.rotations.options import AveragingOptions as AveragingOptions
+    from sfm_shapefit.scene.freedom import FreedomOptions as FreedomOptions
+    from sfm_shapefit.solver.certificate import Certificate as Certificate
+    from sfm_shapefit.solver.certificate import certify as certify
+    from sfm_shapefit.solver.options import SolverOptions as SolverOptions
+    from sfm_shapefit.solver.options import SolverResult as SolverResult
+    from sfm_shapefit.solver.options import Status as Status
+    from sfm_shapefit.solver.solve import solve as solve
+    from sfm_shapefit.tracks.options import NodeOptions as NodeOptions
+    from sfm_shapefit.tracks.options import StructureOptions as StructureOptions
 
 _HOMES = {
     "files.colmap.quiet": ("hear_pycolmap",),
     "files.options": ("MatchingOptions",),
     "adjustment.options": ("AdjustmentOptions",),
-    "pipeline.adjust": ("AdjustedModel", "bundle_adjust"),
-    "pipeline.check": ("check",),
-    "pipeline.check_pieces": ("check_pieces",),
-    "pipeline.checked": ("CheckResult",),
+    "pipeline.bundle_adjust": ("AdjustedModel", "bundle_adjust"),
+    "pipeline.check": ("check", "check_pieces"),
+    "pipeline.referee": ("CheckResult",),
     "pipeline.convert": ("convert",),
     "pipeline.drop_in": ("average_database", "global_mapping"),
     "pipeline.evaluate": ("evaluate",),
@@ -112,60 +122,9 @@ _HOMES = {
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __version__ = "0.1.0"
-__all__ = [
-    "AdjustedModel",
-    "AdjustmentOptions",
-    "AveragedRotations",
-    "AveragingOptions",
-    "Certificate",
-    "CheckResult",
-    "DirectionOptions",
-    "FreedomOptions",
-    "GaugeOptions",
-    "InputError",
-    "InspectOptions",
-    "JoinOptions",
-    "JoinedModel",
-    "LocateOptions",
-    "LocateResult",
-    "MapOptions",
-    "MapResult",
-    "MatchingOptions",
-    "NodeOptions",
-    "Placement",
-    "PlacementOptions",
-    "ShapeFitError",
-    "SolverOptions",
-    "SolverResult",
-    "SourceOptions",
-    "Status",
-    "StructureOptions",
-    "TrustOptions",
-    "UnsolvableError",
-    "ViewGraph",
-    "Workspace",
-    "WriteOptions",
-    "average_database",
-    "average_rotations",
-    "bundle_adjust",
-    "certify",
-    "check",
-    "check_pieces",
-    "convert",
-    "evaluate",
-    "global_mapping",
-    "hear_pycolmap",
-    "inspect",
-    "join",
-    "locate",
-    "map_database",
-    "match_images",
-    "place",
-    "relative_rotations",
-    "solve",
-    "workspace",
-    "write_result",
-]
+__all__ = list(_HOME_OF)
+
+_write_by(lambda: _import_module("sfm_shapefit.pipeline.write").WRITERS)
 
 
 def __getattr__(name: str) -> _Any:

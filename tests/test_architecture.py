@@ -88,7 +88,7 @@ def test_each_room_keeps_within_its_budget_of_lines():
     assert {room: lines[room] for room, most in MOST_LINES.items() if lines[room] < most - SLACK_LINES} == {}
 
 
-@pytest.mark.parametrize("command", ["locate", "map"])
+@pytest.mark.parametrize("command", ["check", "join", "locate", "map", "place"])
 def test_the_pipeline_of_a_command_is_a_page(command):
     text = (PACKAGE / f"pipeline/{command}.py").read_text(encoding="utf-8")
     assert len(text.splitlines()) <= MOST_LINES_OF_A_PAGE

@@ -84,7 +84,7 @@ CHANGES = {
             "facts/model.py",
             "facts/result.py",
             "facts/rigs.py",
-            "pipeline/adjustment.py",
+            "pipeline/camera_adjustment.py",
             "pipeline/finish.py",
             "pipeline/starts.py",
             "scene/freedom.py",

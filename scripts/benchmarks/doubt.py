@@ -30,15 +30,17 @@ from harness.record import Row, at_least, at_most
 from harness.scenes import WRONG_DEG, rotation_errors_deg, set_rotation, temporary_scene
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.judged import judge as judge_placement
+from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.pairs.pair_directions import PairDirections
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
-from sfm_shapefit.pipeline.measure import Measured, Wanted, add_evidence, build_graph, measure, wants_points
-from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
+from sfm_shapefit.pipeline.measure import MeasureRequest, add_evidence, build_graph, measure, wants_points
+from sfm_shapefit.pipeline.placing import place_cameras
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 
 OF_STRECHA = ("fountain-P11", "Herz-Jesus-P8", "Herz-Jesus-P25", "castle-P19", "castle-P30")
 SETS = {
@@ -142,16 +144,16 @@ def turn_cameras(scene: Scene, repeats: int) -> Row:
 
 
 @contextmanager
-def measured(model: ColmapModel, scene: Scene) -> Iterator[tuple[Any, Measured]]:
+def measured(model: ColmapModel, scene: Scene) -> Iterator[tuple[Any, MeasuredPairs]]:
     """Yield the matches of a scene at a model, and what they tell."""
     with open_source(model, choose_inputs(scene.model, scene.database, "auto"), OPTIONS) as source:
-        wanted = Wanted(tracks=wants_points(source, OPTIONS.nodes), errors=True)
+        wanted = MeasureRequest(tracks=wants_points(source, OPTIONS.nodes), errors=True)
         yield source, measure(source, OPTIONS.directions, Clock(threads=THREADS), wanted)
 
 
 def judge(model: ColmapModel, scene: Scene) -> tuple[PairDirections, Judged]:
     """Place the cameras of a model and judge them: `locate` without points."""
-    rigid = find_rigid_parts(model.images)
+    rigid = find_fixed_and_rigged(model.images)
     with measured(model, scene) as (source, told):
         graph = add_evidence(rigid.apply(build_graph(source.images, told, OPTIONS.nodes)), told)
         placed = next(place_cameras(graph, OPTIONS.placement, OPTIONS.nodes, Clock(threads=THREADS)))

@@ -33,10 +33,10 @@ from sfm_shapefit.laplacian.operators import Workers
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12  # range of mu; rounding drowns what lies beyond
 _LEAST_GAIN = 1e-3  # share of the predicted decrease; a step of less is refused
 _ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in its rounding
-_NEAR = 1e-2  # relative fall of the cost by a step; from less on the minimum is near, and the loss may bend
+_NEAR = 1e-2  # relative fall of the cost by a step; after less the minimum is near, and the loss may bend
 # Share of a residual's weight that the loss keeps along it near the minimum; the system stays positive.
 _LEAST_CURVATURE = 0.3
-# Steps of each point by itself before the first joint one; 20 spare no further one of castle-P30 or lego100.
+# Steps of each point by itself before the first joint step; 20 steps save no joint step on real scenes.
 _FIRST_SETTLING = 8
 _MANY_ENTRIES = 4_000_000  # entries, 0.6 GB; more are given up while the system is factored, and made anew
 _STATIONARY = 1e-6  # gradient norm; at less, steps that rounding refuses mean a minimum

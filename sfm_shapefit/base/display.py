@@ -1,6 +1,6 @@
 """How results show themselves: one line in a console, a table or their report in a notebook, plain for JSON.
 
-Folders and reports are written by a layer above this one, which says here how.
+Folders and reports are written by a layer above this one, which the package names here.
 """
 
 import html
@@ -91,12 +91,12 @@ class Writers(NamedTuple):
     """Writes the folder of a result."""
 
 
-_writers: list[Writers] = []
+_loaders: list[Callable[[], Writers]] = []
 
 
-def write_by(writers: Writers) -> None:
-    """Let functions write results."""
-    _writers[:] = [writers]
+def write_by(load: Callable[[], Writers]) -> None:
+    """Let functions write results that are loaded when the first result is written."""
+    _loaders[:] = [load]
 
 
 class Reported(Displayed):
@@ -115,7 +115,7 @@ class Reported(Displayed):
         Raises:
             InputError: if the file exists or cannot be written, or the folder has none of the images.
         """
-        _writers[0].page(self, page, images=images, overwrite=overwrite)
+        _loaders[0]().page(self, page, images=images, overwrite=overwrite)
 
 
 class Written(Reported):
@@ -138,21 +138,21 @@ class Written(Reported):
         Raises:
             InputError: if the folder holds something or cannot be written.
         """
-        _writers[0].folder(self, out, **options)
+        _loaders[0]().folder(self, out, **options)
 
 
 def report_in_notebook(found: Any) -> str:
     """Return the verdict on a result, what is told of it, and the page of its report.
 
-    The page runs in a frame that can reach nothing. It is left out where it is too large, or nobody draws it.
+    The page runs in a frame that can reach nothing. It is left out where it is too large.
     """
     color, statement = _COLORS[found.verdict.grade.value], html.escape(found.verdict.statement)
     rows = [Row("result", found.told.lines), *found.told.rows]
     told = ((label, "\n".join(lines)) for label, lines in rows if lines)
     table = _table_rows(told, " style='text-align:left;white-space:pre-line'")
     shown = f"<b style='color:{color}'>{statement}</b><table>{table}</table>"
-    page = _writers[0].draw(found) if _writers else ""
-    if page and len(page) <= _MOST_BYTES:
+    page = _loaders[0]().draw(found)
+    if len(page) <= _MOST_BYTES:
         shown += (
             f"<iframe sandbox='allow-scripts' style='width:100%;height:{_FRAME_HEIGHT_PX}px;border:0' "
             f'srcdoc="{html.escape(page, quote=True)}"></iframe>'

@@ -287,3 +287,9 @@ def nearest_rotations(matrices: FloatArray) -> FloatArray:
 def principal_lengths(points: FloatArray) -> FloatArray:
     """Return the singular values of points (k, 3) around their mean, largest first."""
     return np.asarray(np.linalg.svd(points - points.mean(axis=0), compute_uv=False))
+
+
+def turned_deg(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return by how many degrees rotations (n, 3, 3) turned, exactly 0 where they kept their bits."""
+    same = (before == after).all(axis=(1, 2))
+    return np.where(same, 0.0, rotation_angles_deg(after.transpose(0, 2, 1) @ before))

@@ -122,7 +122,7 @@ class CompileTime(Listener):  # type: ignore[misc]
         self._depth += 1
 
     def on_end(self, _event: Any) -> None:
-        """Have compiled something."""
+        """Add up the seconds once the outermost compilation has ended."""
         self._depth -= 1
         if self._depth == 0:
             self.seconds += time.perf_counter() - self._since

@@ -32,7 +32,7 @@ from sfm_shapefit.cli.flags import (
 from sfm_shapefit.cli.root import app
 
 if TYPE_CHECKING:
-    from sfm_shapefit.pipeline.checked import CheckResult
+    from sfm_shapefit.pipeline.referee import CheckResult
 
 
 @app.command(
@@ -178,7 +178,7 @@ def _check_pieces(
 ) -> bool:
     """Judge the models in a folder, print one table, and return whether one of them is to be kept."""
     from sfm_shapefit.files.colmap.quiet import hear_pycolmap
-    from sfm_shapefit.pipeline.check_pieces import check_pieces
+    from sfm_shapefit.pipeline.check import check_pieces
 
     with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
         found = check_pieces(folder, database, second_opinion=second_opinion, progress=progress)

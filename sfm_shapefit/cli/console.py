@@ -22,7 +22,7 @@ from sfm_shapefit.base.errors import MissingExtraError, ShapeFitError, Unsolvabl
 from sfm_shapefit.base.wording import make_printable
 
 if TYPE_CHECKING:
-    from sfm_shapefit.pipeline.clock import Progress
+    from sfm_shapefit.base.clock import Progress
     from sfm_shapefit.pipeline.warm_up import Tell
 
 EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING = 3, 4, 5  # exit codes; see the header

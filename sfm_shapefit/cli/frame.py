@@ -27,10 +27,10 @@ from sfm_shapefit.cli.flags import OutputFlags, read_options
 from sfm_shapefit.files.options import MADE_FIRST
 
 if TYPE_CHECKING:
+    from sfm_shapefit.base.clock import Progress
     from sfm_shapefit.base.kernel_cache import CompileTime
     from sfm_shapefit.facts.map_result import JoinedModel, MapResult
     from sfm_shapefit.facts.result import GraphResult, LocateResult
-    from sfm_shapefit.pipeline.clock import Progress
 
     Result = LocateResult | MapResult | GraphResult | JoinedModel
 
@@ -71,7 +71,7 @@ class Run(Generic[S]):
 
     def _tell(self, found: "Result", source: Path, out: Path) -> None:
         """Print the details if they are wanted, the answer, the verdict, and what to do next."""
-        from sfm_shapefit.pipeline.colors import has_colors
+        from sfm_shapefit.pipeline.write import has_colors
 
         told, pages = found.told, [str(out / folder / "report.html") for folder in found.told.folders]
         if self.flags.verbose:

@@ -48,12 +48,7 @@ from sfm_shapefit.facts.scene import Loop, told_distances
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.grade import (
-    Shares,
-    judge_model,
-    too_few_to_judge,
-    weigh_evidence,
-)
+from sfm_shapefit.judgement.grade import Shares, judge_model, too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_each, of_model
@@ -212,7 +207,7 @@ class LocateResult(_Placed):
     prior_fit: PriorFit | None = None
     """How well position priors fit the images and the `directions`; None where they do not set the scale."""
     num_seen: IntArray
-    """(n,) number of points that an image saw, where it was left out because of it; -1 for all others."""
+    """(n,) number of points that an image saw, where it was left out because these were too few; else -1."""
     unsupported: BoolArray
     """(n,) images hardly any of whose matches makes a point with a third image; left out too, unless the
     least trust is 0."""
@@ -228,14 +223,14 @@ class LocateResult(_Placed):
     control_points: tuple[ControlPoint, ...] = ()
     """Ground control points with their residuals, where some are given."""
     suspicions: tuple[Reason, ...] = ()
-    """What speaks against the model beside its own evidence: steps that failed, and what those who gave the
-    rotations saw."""
+    """What else speaks against the model: steps that failed, rotations that were far off, and what the
+    averaging of rotations saw."""
     recognized: Reason | None = None
     """What the input seems to be instead of what it was read as; None if it is not."""
     join: JoinFacts | None = None
     """What came of joining it to a larger model of `map`."""
     elsewhere: BoolArray | None = None
-    """(n,) images that stand in another model of `map` alone, and are not missing here; None if it is one."""
+    """(n,) images that only another model of `map` has; they are not missing here. None without others."""
 
     @property
     def reconstruction(self) -> "pycolmap.Reconstruction":
@@ -314,7 +309,7 @@ class LocateResult(_Placed):
         shares = Shares(
             self.observations.contradicting,
             placed=float(np.mean(is_posed if elsewhere is None else is_posed[~elsewhere])),
-            here=float(np.mean(is_posed)),
+            placed_here=float(np.mean(is_posed)),
         )
         left_out, lone = (
             [self.images.names[camera] for camera in cameras]

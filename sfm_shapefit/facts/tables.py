@@ -6,6 +6,7 @@
 import csv
 import io
 import itertools
+import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -16,10 +17,12 @@ from typing import Any, Literal, TextIO
 import numpy as np
 import numpy.typing as npt
 
+from sfm_shapefit.base.atomic_folder import MARKER
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.judgement.limits import KNOWN_DEG
 from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.scene.given import Datum
 
 TableName = Literal["cameras", "pairs"]
 Column = npt.NDArray[Any]
@@ -141,6 +144,21 @@ def read_trust(path: Path) -> dict[str, float]:
         return {name_in(cells["name"]): float(cells["trust"] or "nan") for cells in rows}
     except (InputError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise InputError(f"{path} is damaged or of another version ({error}); run locate again") from error
+
+
+def model_datum(model: Any) -> Datum | None:
+    """Return the datum of a result, or that in locate.json beside a model; None without."""
+    if not isinstance(model, Path | str):
+        known = getattr(getattr(model, "facts", None), "datum", None)
+        return known and Datum(known.latitude_deg, known.longitude_deg, known.altitude_m)
+    file = Path(model) / MARKER
+    if not file.is_file():
+        return None
+    try:
+        found = json.loads(text_of(file)).get("datum")
+        return None if found is None else Datum(**found)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise InputError(f"{file} cannot be read; run locate again, or remove it") from error
 
 
 def name_in(cell: str) -> str:

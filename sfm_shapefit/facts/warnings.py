@@ -100,8 +100,8 @@ def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
         worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
         above_all = "above all " if len(uncertain) > 1 else ""
         yield (
-            f"{counted_are(len(uncertain), 'camera')} uncertain by more than {RARE:.0%} of the extent, "
-            f"{above_all}{worst}; see sigma and trust in cameras.csv"
+            f"{counted_are(len(uncertain), 'camera')} uncertain by more than {RARE:.0%} of the "
+            f"extent, {above_all}{worst}; see sigma and trust in cameras.csv"
         )
 
 

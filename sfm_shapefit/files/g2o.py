@@ -21,13 +21,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.quaternions import matrices_of
-from sfm_shapefit.files.lines import (
-    UNIT_TOLERANCE,
-    TextTable,
-    first_words,
-    read_lines,
-    rotations_by_name,
-)
+from sfm_shapefit.files.lines import UNIT_TOLERANCE, TextTable, first_words, read_lines, rotations_by_name
 from sfm_shapefit.files.onedsfm import EpipolarGeometries, geometries_of
 
 _POSE, _RELATIVE_POSE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"

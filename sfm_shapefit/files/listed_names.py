@@ -34,27 +34,27 @@ def find_images(file: Path, listed: Sequence[str], names: Sequence[str]) -> IntA
     Raises:
         InputError: if two names are of one image.
     """
-    found = same_images(listed, names).places
+    places = same_images(listed, names).places
     for match in (_by_stems, _by_numbers):
-        left = np.flatnonzero(found < 0).tolist()
+        left = np.flatnonzero(places < 0).tolist()
         units = _UNITS if len(left) == len(listed) else _UNITS[:1]
         if left:
-            rows, taken = match([listed[k] for k in left], names, units), set(found.tolist())
+            rows, taken = match([listed[k] for k in left], names, units), set(places.tolist())
             whole = [_FOLDER.search(listed[k]) is not None for k in left]  # which may be another folder's
-            found[left] = [-1 if own and row in taken else row for own, row in zip(whole, rows, strict=True)]
-    for row, count in Counter(found[found >= 0].tolist()).items():
+            places[left] = [-1 if own and row in taken else row for own, row in zip(whole, rows, strict=True)]
+    for row, count in Counter(places[places >= 0].tolist()).items():
         if count > 1:
-            first, second = (listed[k] for k in np.flatnonzero(found == row)[:2].tolist())
+            first, second = (listed[k] for k in np.flatnonzero(places == row)[:2].tolist())
             raise InputError(
                 f"{file}: {first} and {second} are both the image {names[row]}; keep one of them"
             )
-    return found
+    return places
 
 
 def named_as(file: Path, listed: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
     """Return the names of a list, those of images by the names that these have elsewhere."""
     rows = find_images(file, listed, names).tolist()
-    return tuple(own if row < 0 else names[row] for own, row in zip(listed, rows, strict=True))
+    return tuple(name if row < 0 else names[row] for name, row in zip(listed, rows, strict=True))
 
 
 def _by_stems(listed: Sequence[str], names: Sequence[str], _: Sequence[Decimal]) -> list[int]:
@@ -75,8 +75,8 @@ def _by_numbers(listed: Sequence[str], names: Sequence[str], units: Sequence[Dec
     if len(row_of) < len(numbers) - numbers.count(None):
         return [-1] * len(listed)
     wanted, ordered = [number_of(name, alone=True) for name in listed], sorted(row_of)
-    found = ([None if one is None else _nearest(one, unit, ordered) for one in wanted] for unit in units)
-    most = max(found, key=lambda some: len(some) - some.count(None))
+    nearest = ([None if one is None else _nearest(one, unit, ordered) for one in wanted] for unit in units)
+    most = max(nearest, key=lambda some: len(some) - some.count(None))
     return [-1 if number is None else row_of[number] for number in most]
 
 
@@ -95,8 +95,8 @@ def _nearest(number: Decimal, unit: Decimal, ordered: Sequence[Decimal]) -> Deci
 
 def number_of(name: str, *, alone: bool = False) -> Decimal | None:
     """Return the number that the name of an image ends with, or is `alone`, without folders and suffix."""
-    found = (NUMBER.fullmatch if alone else NUMBER.search)(stem_of(name))
-    return None if found is None else Decimal(found[0])
+    match = (NUMBER.fullmatch if alone else NUMBER.search)(stem_of(name))
+    return None if match is None else Decimal(match[0])
 
 
 def stem_of(name: str) -> str:

@@ -121,14 +121,14 @@ class _Intrinsics(NamedTuple):
 
     def focal_shares(self) -> tuple[float, float]:
         """Return focal lengths over width and height; NaN where there is none."""
-        found = []
+        shares = []
         for axis, side in zip("xy", "wh", strict=True):
             share = self.number(f"fl_{axis}") / (self.number(side) or np.nan)
             angle = self.number(f"camera_angle_{axis}")
             if np.isnan(share) and _LEAST_ANGLE_RAD < angle < np.pi:
                 share = 0.5 / np.tan(0.5 * angle)
-            found.append(float(share))
-        return found[0], found[1]
+            shares.append(float(share))
+        return shares[0], shares[1]
 
     def read(self) -> Lens | None:
         """Return the lens; None where size or focal length is missing, or COLMAP has no such model."""
@@ -165,9 +165,9 @@ def _model_that_has(kind: str, family: str, distortion: dict[str, float], *, are
     nonzero = {key for key, value in distortion.items() if value}
     stated = nonzero | (distortion.keys() & {*_MODELS[family][2]})
     for name, wanted in [(kind, nonzero)] * (kind != family) + [(name, stated) for name in _MODELS]:
-        own, num_focals, keys = _MODELS[name]
+        parameters, num_focals, keys = _MODELS[name]
         has = {*keys[:_NUM_NUMERATOR]}
-        if own == family and wanted <= has and (are_equal or num_focals == 2):
+        if parameters == family and wanted <= has and (are_equal or num_focals == 2):
             return name
     return ""
 
@@ -187,8 +187,10 @@ def nerf_text(images: Images, points_file: str = "") -> str:
     matrices[:, :3, 3] = images.centers
     frames: list[dict[str, Any]] = []
     for name, lens, matrix in zip(images.names, images.lens_of.tolist(), matrices, strict=True):
-        own = {} if shared and not images.lenses[0].is_panorama else intrinsics[lens]
-        frames.append({"file_path": f"images/{name}", **own, "transform_matrix": (matrix + 0.0).tolist()})
+        of_frame = {} if shared and not images.lenses[0].is_panorama else intrinsics[lens]
+        frames.append(
+            {"file_path": f"images/{name}", **of_frame, "transform_matrix": (matrix + 0.0).tolist()}
+        )
     points = {"ply_file_path": points_file} if points_file else {}
     return (
         json.dumps({**shared, **points, "frames": frames}, indent=2, ensure_ascii=False, allow_nan=False)
@@ -197,7 +199,6 @@ def nerf_text(images: Images, points_file: str = "") -> str:
 
 
 def _intrinsics(lens: Lens) -> dict[str, Any]:
-    """Return a lens's keys."""
     if lens.is_panorama:
         width, height = lens.parameters
         values = (0.5 * width, height, 0.5 * width, 0.5 * height)

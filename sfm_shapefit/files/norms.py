@@ -25,5 +25,5 @@ def say_normalized(norms: FloatArray) -> str:
     if not len(off):
         return ""
     worst = off[np.argmax(np.abs(np.log(off)))]
-    said = f"{counted_are(len(off), 'rotation quaternion')} normalized, the worst of norm {worst:.3g}"
-    return f"{said} instead of 1; correct what wrote them"
+    sentence = f"{counted_are(len(off), 'rotation quaternion')} normalized, the worst of norm {worst:.3g}"
+    return f"{sentence} instead of 1; correct what wrote them"

@@ -24,12 +24,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import (
-    FLIP_YZ,
-    nearest_rotations,
-    normalized,
-    tangent_bases,
-)
+from sfm_shapefit.base.geometry import FLIP_YZ, nearest_rotations, normalized, tangent_bases
 from sfm_shapefit.files.lines import (
     UNIT_TOLERANCE,
     TextTable,

@@ -148,7 +148,7 @@ def _observations(file: Path, points: Sequence[str], names: Sequence[str]) -> tu
     If an image observes a point several times, the first observation counts; points of one image are none.
     """
     tracks = file.with_name(_TRACKS_FILE)
-    found: dict[tuple[int, int], tuple[float, float]] = {}
+    observations: dict[tuple[int, int], tuple[float, float]] = {}
     if tracks.is_file():
         point_of, image_of = ({key: k for k, key in enumerate(keys)} for keys in (points, names))
         for number, line in enumerate(text_of(tracks).splitlines(), start=1):
@@ -162,9 +162,9 @@ def _observations(file: Path, points: Sequence[str], names: Sequence[str]) -> tu
             if not (np.isfinite(x) and np.isfinite(y)):
                 raise InputError(f"{tracks}, line {number}: has a number that is not finite")
             if track in point_of and image in image_of:
-                found.setdefault((point_of[track], image_of[image]), (x, y))
-    observed = np.array(list(found), dtype=np.int64).reshape(-1, 2)
-    coordinates = np.array(list(found.values()), dtype=np.float64).reshape(-1, 2)
+                observations.setdefault((point_of[track], image_of[image]), (x, y))
+    observed = np.array(list(observations), dtype=np.int64).reshape(-1, 2)
+    coordinates = np.array(list(observations.values()), dtype=np.float64).reshape(-1, 2)
     rows = np.argsort(observed[:, 1], kind="stable")
     rows = rows[np.bincount(observed[:, 0])[observed[rows, 0]] >= 2]
     return observed[rows], coordinates[rows]

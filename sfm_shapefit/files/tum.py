@@ -76,10 +76,10 @@ def read_tum(file: Path) -> ListedPoses:
 def _columns_of(header: str) -> tuple[int, ...]:
     """Return the columns of tx ty tz qx qy qz qw that a header names; none if it lacks one."""
     cells = header.split(",") if "," in header else header.split()
-    found: dict[str, int] = {}
+    columns: dict[str, int] = {}
     for k, cell in enumerate(_UNIT.sub("", cell).strip().lower() for cell in cells):
-        found.setdefault(("q" if _TURN.search(cell) else "t") + cell[-1:], k)
-    return tuple(found[key] for key in _KEYS) if found.keys() >= set(_KEYS) else ()
+        columns.setdefault(("q" if _TURN.search(cell) else "t") + cell[-1:], k)
+    return tuple(columns[key] for key in _KEYS) if columns.keys() >= set(_KEYS) else ()
 
 
 def tum_text(images: Images) -> str:
@@ -108,7 +108,6 @@ def poses_csv(images: Images) -> str:
 
 
 def _timestamps(names: tuple[str, ...]) -> list[str]:
-    """Return the timestamp of each image, as text."""
     if len({number_of(name) for name in names} - {None}) == len(names):
         return [NUMBER.findall(stem_of(name))[0] for name in names]
     position = {name: k for k, name in enumerate(sorted(names))}

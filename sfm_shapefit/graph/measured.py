@@ -7,8 +7,10 @@ rigid piece, takes what `MeasuredGraph.part` makes of it.
 from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 
@@ -145,3 +147,28 @@ class MeasuredGraph:
             groups=None if groups is None else groups.restricted_to(nodes),
             fixed_group=fixed,
         )
+
+
+def direction_covariances(graph: ViewGraph, sigma: npt.ArrayLike) -> FloatArray:
+    """Return the covariances (m, d - 1, d - 1) of directions from these, or from standard deviations (m,)."""
+    given = real_numbers("sigma must be numbers, NaN where they are unknown", sigma)
+    m, k = graph.num_edges, graph.dimension - 1
+    if given.shape not in ((m,), (m, k, k)):
+        raise InputError(
+            f"sigma has shape {given.shape}; give one standard deviation, radians, for each of the {m} "
+            f"directions, or covariances of shape {(m, k, k)}"
+        )
+    known = np.nan_to_num(given, posinf=np.inf, neginf=-np.inf)
+    if given.ndim > 1 and not np.allclose(known, known.swapaxes(1, 2)):
+        raise InputError("sigma has covariances that are not symmetric; give symmetric ones")
+    if np.any(known > (np.pi if given.ndim == 1 else np.pi**2)) and not np.isinf(known).any():
+        raise InputError(
+            "sigma has values beyond pi radians, the largest angle; give radians, and NaN where they are "
+            "unknown"
+        )
+    if np.isinf(known).any() or np.any((known if given.ndim == 1 else np.linalg.eigvalsh(known)) < 0.0):
+        raise InputError(
+            "sigma has negative or infinite values; give standard deviations or covariances, and NaN where "
+            "they are unknown"
+        )
+    return np.asarray(np.square(given)[:, None, None] * np.eye(k) if given.ndim == 1 else given)

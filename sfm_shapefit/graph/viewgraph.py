@@ -167,7 +167,6 @@ def _check_arrays(
 
 
 def _refuse(bad: npt.NDArray[np.bool_], edges: IntArray, reason: str) -> None:
-    """Raise InputError for the first edge that is bad."""
     if bad.any():
         index = int(np.argmax(bad))
         raise InputError(f"edge {index} ({edges[index, 0]}, {edges[index, 1]}) {reason}")

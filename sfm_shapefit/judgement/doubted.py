@@ -10,9 +10,9 @@ With s = placed / (placed + turned) of `turns`, the share of the pairs that agre
     unsupported   f = 0
     unknown       trust as by the share of pairs alone
 
-Where rotations are not to be doubted, f = 1. hold' is half where the pairs leave 20 % of the scene open,
-twice what it takes without their rotations: sigma is drawn from residuals that wrong pairs widen, and
-these are known better here. A pair whose rotation agrees and whose direction does not, as of repeated
+Where rotations are not to be doubted, f = 1. hold' is 0.5 for a sigma of 20 % of the scene. That sigma is
+twice the one at which `trust` has 0.5, because wrong pairs widen the residuals that sigma is drawn from, and
+wrong pairs are known better here. A pair whose rotation agrees and whose direction does not, as of repeated
 structure, says nothing of a turn: `places` asks those where the camera is instead.
 """
 

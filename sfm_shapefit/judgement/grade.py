@@ -69,8 +69,8 @@ class Shares(NamedTuple):
 
     contradicting: float = np.nan
     placed: float = np.nan
-    here: float = np.nan
-    """The same of all images; of several models, the others' are missing here, though they are placed."""
+    placed_here: float = np.nan
+    """Share of all images that are in this model; images of other models of `map` count as missing here."""
 
 
 def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
@@ -230,8 +230,8 @@ def _weigh_shares(shares: Shares) -> Iterator[Reason]:
     if shares.placed < FEW_PLACED:
         grade = Grade.DO_NOT_USE if shares.placed < HALF else Grade.LOOK
         yield of_model(Kind.LEFT_OUT, f"only {shares.placed:.0%} of the images are placed", grade)
-    elif shares.here < FEW_PLACED:
-        yield in_another_model(shares.here)
+    elif shares.placed_here < FEW_PLACED:
+        yield in_another_model(shares.placed_here)
 
 
 def uncertain_cameras(placement: Judged) -> IntArray:

@@ -1,17 +1,24 @@
 """How well the images of a model are held by its 3D points: their number, errors, tracks, and coverage.
 
-Errors are those of COLMAP's own projection, through any of its camera models.
+Errors are those of COLMAP's own projection, through any of its camera models. How much of the picture the
+points cover decides nothing: on an object before a plain wall they cover little. The limits of weak images
+are set by the bundled scenes and twelve sound models of COLMAP, see "What `check` calls weak" in
+scripts/results/notes.md.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.judgement.reasons import Kind, Reason, of_each
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 
+_FEWEST_POINTS = 30  # points; an image that sees fewer is weak
+_LARGE_PX, _LARGE_OF_USUAL = 0.75, 2.0  # pixels and usual errors; an image whose error is above both is weak
 _CELLS = 8  # cells per side of the picture; its coverage is the share of cells with a point
 
 
@@ -54,3 +61,23 @@ def image_quality(points: Points, images: Images, pictures: Pictures) -> ImageQu
         point_errors_px=np.bincount(seen, misses_px, points.num_points) / lengths,
         point_track_lengths=lengths,
     )
+
+
+def find_weak_images(images: Images, quality: ImageQuality) -> Iterator[Reason]:
+    """Yield what is weak about how points hold each image: they are few, or miss it by much.
+
+    A frame is held by one of its images.
+    """
+    finite = quality.errors_px[np.isfinite(quality.errors_px)]
+    usual_px = float(np.median(finite)) if len(finite) else np.nan
+    num_points = np.zeros(len(images.frames.ids))
+    np.maximum.at(num_points, images.frame_of, quality.num_points)
+    has_points = len(quality.point_errors_px) > 0  # a lack of all is said of the whole model
+    for k, frame in enumerate(images.frame_of.tolist()):
+        if has_points and num_points[frame] < _FEWEST_POINTS:
+            seen = f"only {quality.num_points[k]}" if quality.num_points[k] else "no"
+            yield from of_each(Kind.POINTS, images.names[k : k + 1], f"it sees {seen} 3D points")
+        if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual_px):
+            error_px = quality.errors_px[k]
+            clause = f"its reprojection error is {error_px:.1f} px, where {usual_px:.1f} px is usual"
+            yield from of_each(Kind.POINTS, images.names[k : k + 1], clause)

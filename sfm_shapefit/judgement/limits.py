@@ -9,11 +9,12 @@ has twice as many is believed."""
 HALF = 1.0 / OUTNUMBERED
 """Share of those for the other explanation that one needs at least to be its rival."""
 MANY = 1.0 / (1.0 + OUTNUMBERED)
-"""Share of pairs of a camera, or of cameras; where more speak against, the rest does not outnumber them."""
+"""Share of the pairs of a camera, or of the cameras, that may contradict; the rest outnumbers no more."""
 FEW = 0.1
 """Share of cameras, of pairs, or of the spread of the scene; less is local and leaves the whole as it is."""
 RARE = 0.05
-"""Share of what is sound that is off by chance; and of the extent, by which a sound camera is off at most."""
+"""Share of sound pairs or cameras that are off by chance. Also the largest error of a sound camera, as a
+share of the extent."""
 SIGMAS = 3.0
 """Standard deviations; what is farther off is no noise."""
 SURE_SIGMAS = OUTNUMBERED * SIGMAS

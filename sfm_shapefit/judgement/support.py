@@ -49,10 +49,10 @@ class Support(NamedTuple):
     """How the points that their matches make support images."""
 
     num_seen: IntArray
-    """(i,) points that an image saw which was left out because they are too few, or hardly any of those that
-    its matches could make; -1 for all others."""
+    """(i,) number of points that an image saw, where it was left out because these were too few; -1 for
+    images that were not left out for that."""
     unsupported: BoolArray
-    """(i,) images hardly any of whose matches makes a point; of least trust 0 they are not left out."""
+    """(i,) images whose matches hardly make points; they are left out unless the option min_trust is 0."""
     observations: ObservationShares
     """Shares of keypoints matched in two other images that see a point, and that contradict the cameras."""
 

@@ -1,9 +1,9 @@
 """Ties: what crosses between two groups of cameras and fits, and whether it checks how they stand.
 
 Groups that are each sound stand to one another by a similarity of seven unknowns, so that whatever little
-crosses between them determines it, and fits: it is no evidence. Cameras are a group if they are one rigid
-piece by the points that two of them share, which three images see: as many as no chance makes, and twice as
-many as miss. Two groups are one if more crosses than seven unknowns explain,
+crosses between them determines it, and fits: it is no evidence. Cameras are a group if points that two of
+them share, and three images see, make them one rigid piece: more points than chance makes, and twice as many
+as miss. Two groups are one if more crosses than seven unknowns explain,
 
     points   so many again, also without those of any one camera of either side
     pairs    that agree, three of them, and two without any one camera, half of those that contradict or more

@@ -51,7 +51,7 @@ class _PixelMatches(NamedTuple):
     """(k, 2) rows of the lenses of both images."""
 
 
-def find_lenses(view: View, asked: BoolArray, doubted: BoolArray) -> dict[int, Lens]:
+def find_lenses(view: View, wanted: BoolArray, doubted: BoolArray) -> dict[int, Lens]:
     """Return lenses with the focal lengths that matches want, by row; nothing of those left open.
 
     Args:
@@ -60,24 +60,26 @@ def find_lenses(view: View, asked: BoolArray, doubted: BoolArray) -> dict[int, L
         doubted: (l,) lenses whose focal lengths are not known; pairs of others of these say nothing.
     """
     images = view.images
-    kinds, num_images = defaultdict(list), np.bincount(images.lens_of, minlength=len(asked))
-    for k in np.flatnonzero(asked).tolist():
+    kinds, num_images = defaultdict(list), np.bincount(images.lens_of, minlength=len(wanted))
+    for k in np.flatnonzero(wanted).tolist():
         lens = images.lenses[k]
         kinds[lens.model, lens.width, lens.height, lens.parameters].append(k)
-    found: dict[int, Lens] = {}
+    lenses: dict[int, Lens] = {}
     for rows in sorted(kinds.values(), key=lambda rows: (-num_images[rows].sum(), rows))[:_MOST_KINDS]:
-        own = np.isin(np.arange(len(asked)), rows)
-        matches, share = _choose_matches(view, own, own | ~doubted), -1.0
+        of_group = np.isin(np.arange(len(wanted)), rows)
+        matches, share = _choose_matches(view, of_group, of_group | ~doubted), -1.0
         start = images.lenses[rows[0]]
         for lens in (start, *(start.bent(bend) for bend in _BENDS.get(start.model, ()))):
-            tried = tuple(lens if is_own else other for other, is_own in zip(images.lenses, own, strict=True))
-            factor, best = _find_factor(matches, tried, own)
+            tried = tuple(
+                lens if is_own else other for other, is_own in zip(images.lenses, of_group, strict=True)
+            )
+            factor, best = _find_factor(matches, tried, of_group)
             if factor is not None and best > share:
                 share, parameters = best, lens.longer(factor).parameters
-                found |= {k: replace(images.lenses[k], parameters=parameters) for k in rows}
+                lenses |= {k: replace(images.lenses[k], parameters=parameters) for k in rows}
             if best >= _FITS:
                 break
-    return found
+    return lenses
 
 
 def _choose_matches(view: View, own: BoolArray, known: BoolArray) -> _PixelMatches:

@@ -69,8 +69,8 @@ def matched_shares(
     for side, other in ((0, 1), (1, 0)):
         maps = _affine_maps(own[side], own[other], batch.offsets[:-1])
         for k, (part, ends, affine) in enumerate(zip(rows, pairs, maps, strict=True)):
-            image, there = images[ends[side]], images[ends[other]]
-            sides[side, k] = _share(image, batch.keypoints[part, side], affine, there.size)
+            image, other_image = images[ends[side]], images[ends[other]]
+            sides[side, k] = _share(image, batch.keypoints[part, side], affine, other_image.size)
     finite = np.isfinite(sides)  # a side that says nothing leaves it to the other
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(finite, sides, 0.0).sum(axis=0) / finite.sum(axis=0))

@@ -6,23 +6,24 @@ from pathlib import Path
 
 import numpy as np
 
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.options import MapOptions
-from sfm_shapefit.files.colmap.database import DatabaseMatches
+from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself, read_source
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.files.model_folder import model_folders
 from sfm_shapefit.judgement.evidence import fit_pairs
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pipeline.checked import CheckResult, OtherModel, check_source
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
-from sfm_shapefit.pipeline.map import map_opened
-from sfm_shapefit.pipeline.pictures import AskedPictures, match_pictures
+from sfm_shapefit.pipeline.map import map_database, map_opened
+from sfm_shapefit.pipeline.pictures import match_pictures
+from sfm_shapefit.pipeline.referee import CheckResult, OtherModel, check_source
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
-from sfm_shapefit.solver.options import SolverOptions
 
 
 def check(
@@ -54,17 +55,16 @@ def check(
     """
     if max_minutes is not None and not max_minutes >= 0.0:
         raise InputError(f"max_minutes must be >= 0, got {max_minutes}")
-    clock = Clock.of(progress, SolverOptions())
+    clock = Clock.of(progress)
     with clock("read"):
         inputs = choose_inputs(model, database)
-        asked = None
-        if images is not None and inputs.database is None and max_minutes != 0.0:
-            asked = AskedPictures(folder=Path(images), max_minutes=max_minutes)
-        posed = read_by_itself(model, with_lenses=True) if asked else read_source(model, database)[0]
+        has_pictures = images is not None and inputs.database is None and max_minutes != 0.0
+        posed = read_by_itself(model, with_lenses=True) if has_pictures else read_source(model, database)[0]
     other = None
     with ExitStack() as stack:
-        if asked is not None:
-            inputs = replace(stack.enter_context(match_pictures(posed, asked, clock)), folder=inputs.folder)
+        if images is not None and has_pictures:
+            made = stack.enter_context(match_pictures(posed, Path(images), max_minutes, clock))
+            inputs = replace(made, folder=inputs.folder)
         source = stack.enter_context(open_source(posed, inputs))
         if second_opinion and isinstance(source.matches, DatabaseMatches):
             file = source.matches.file
@@ -79,23 +79,68 @@ def check(
 
 
 def _map_anew(
-    file: DatabaseFile, posed: ColmapModel, found: bool | MapResult, clock: Clock
+    file: DatabaseFile, posed: ColmapModel, mapped: bool | MapResult, clock: Clock
 ) -> OtherModel | None:
     """Return the model of the database that has most images in common; None if nothing can be placed."""
-    if not isinstance(found, MapResult):
+    if not isinstance(mapped, MapResult):
         try:
-            found = map_opened(file, MapOptions(), clock)
+            mapped = map_opened(file, MapOptions(), clock)
         except UnsolvableError:
             return None
-    models = [model.located for model in found.models]
+    models = [model.located for model in mapped.models]
     number = max(range(len(models)), key=lambda k: _num_common(posed.images, models[k].placed))
     best = models[number]
     doubted = np.zeros(best.placed.num_images, dtype=np.bool_)
     doubted[best.placement.cameras] = best.placement.assessment.ambiguous
     doubted[[place.camera for place in best.evidence.places]] = True
     fits = fit_pairs(best.placed.centers, best.directions)
-    return OtherModel(best.placed, fits, doubted, found, number)
+    return OtherModel(best.placed, fits, doubted, mapped, number)
 
 
 def _num_common(images: Images, others: Images) -> int:
     return int(np.sum(same_images(images.names, others.names).places >= 0))
+
+
+def check_pieces(
+    folder: Path | str,
+    database: Path | str | None = None,
+    *,
+    second_opinion: bool | MapResult = True,
+    progress: Progress | None = None,
+) -> CheckedPieces:
+    """Judge each of several models in a folder, and say which to keep and what of them contradicts.
+
+    A model is to be kept if it is good or to be looked at, and if half of its images or more are in no larger
+    one that is kept. Models contradict one another if the focal lengths of one device differ by a tenth.
+
+    Args:
+        folder: has the models in folders that are called by numbers, as sparse has 0 and 1.
+        database, second_opinion, progress: as for `check`; the database is mapped once.
+
+    Raises:
+        InputError: if the folder has no two models, or the database cannot be used.
+    """
+    models = model_folders(Path(folder))
+    if len(models) < 2:
+        raise InputError(f"{folder} has no models 0, 1, ...; give a folder of several, or `check` one")
+    source = database if database is not None else find_database(models[0])
+    if second_opinion is True and source is not None:
+        try:
+            second_opinion = map_database(source, progress=progress)
+        except UnsolvableError:
+            second_opinion = False  # nor could `check` map it, for any of the models
+        except InputError:
+            pass  # `check` says why
+    pieces, images = [], dict[str, Images]()
+    for path in models:
+        name = str(path)
+        try:
+            checked = check(path, database, second_opinion=second_opinion, progress=progress)
+        except InputError as error:
+            pieces.append(CheckedPiece(folder=name, error=str(error)))
+            continue
+        images[name] = checked.model.images
+        pieces.append(CheckedPiece.of_model(name, images[name], checked.facts))
+    if not images:
+        raise InputError(f"{folder} holds no COLMAP model that can be read; {pieces[0].error}")
+    return CheckedPieces.compare(pieces, images)

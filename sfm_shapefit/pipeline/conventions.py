@@ -54,8 +54,8 @@ def ask_convention(source: MatchSource, threads: int) -> Recognized | None:
     counts = np.repeat(-view.matches.num_matches[view.rows].astype(np.int64), 2)
     rank = rank_within(view.pairs.ravel(), counts).reshape(-1, 2).min(axis=1)
     chosen = np.lexsort((counts[::2], rank))[:_MOST_PAIRS]
-    asked = view.pairs[np.sort(chosen[rank[chosen] < _FIRST_PAIRS])]
-    return recognize_convention(source.images.rotations, ask_rotations(source, asked, threads), written)
+    pairs = view.pairs[np.sort(chosen[rank[chosen] < _FIRST_PAIRS])]
+    return recognize_convention(source.images.rotations, ask_rotations(source, pairs, threads), written)
 
 
 @contextmanager
@@ -73,22 +73,22 @@ def naming_convention(source: MatchSource, threads: int) -> Iterator[None]:
         raise
 
 
-def _are_rotations_doubtful(found: LocateResult, source: MatchSource) -> bool:
+def _are_rotations_doubtful(result: LocateResult, source: MatchSource) -> bool:
     """Return whether matches turned most of the given rotations, or many pairs contradict the result."""
-    if isinstance(source.matches, TrackMatches) or not found.agreeing_pairs >= _LEAST_AGREEING:
+    if isinstance(source.matches, TrackMatches) or not result.agreeing_pairs >= _LEAST_AGREEING:
         return True
-    turned = found.images.rotations @ source.images.rotations.transpose(0, 2, 1)
+    turned = result.images.rotations @ source.images.rotations.transpose(0, 2, 1)
     return not float(np.nanmedian(rotation_angles_deg(turned))) <= _MOST_TURNED_DEG
 
 
-def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> LocateResult:
+def tell_convention(result: LocateResult, source: MatchSource, threads: int) -> LocateResult:
     """Return a result that is not good with the convention that its input is in, if that can be told."""
-    is_asked = found.verdict.grade is not Grade.GOOD and _are_rotations_doubtful(found, source)
+    is_asked = result.verdict.grade is not Grade.GOOD and _are_rotations_doubtful(result, source)
     recognized = ask_convention(source, threads) if is_asked else None
     if recognized is None:
-        return found
-    others = tuple(one for one in found.suspicions if not one.sentence.endswith(IS_ITS_DATABASE))
-    first = recognized.sentence + ("; other warnings may come of that" if found.warnings else "")
-    warnings = (first, *found.warnings)
+        return result
+    others = tuple(one for one in result.suspicions if not one.sentence.endswith(IS_ITS_DATABASE))
+    first = recognized.sentence + ("; other warnings may come of that" if result.warnings else "")
+    warnings = (first, *result.warnings)
     reason = of_model(Kind.INPUT, recognized.clause)
-    return replace(found, recognized=reason, suspicions=others, warnings=warnings)
+    return replace(result, recognized=reason, suspicions=others, warnings=warnings)

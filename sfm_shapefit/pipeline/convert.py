@@ -16,7 +16,7 @@ from sfm_shapefit.base.errors import InputError
 
 if TYPE_CHECKING:
     from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
-    from sfm_shapefit.pipeline.world import World
+    from sfm_shapefit.files.colmap.world import World
 
 _POINTS = "_points.ply"  # behind the stem of a transforms.json
 
@@ -103,10 +103,11 @@ def write_converted(
 ) -> Converted:
     """Write a model in another format, in a system and with an offset; `convert` raises the same."""
     # Here, so that the command line knows the formats without loading pycolmap.
+    from sfm_shapefit.facts.tables import model_datum
     from sfm_shapefit.files.colmap.listed_poses import read_by_itself
     from sfm_shapefit.files.colmap.model import model_of, read_model
     from sfm_shapefit.files.colmap.reconstructions import transform_model
-    from sfm_shapefit.pipeline.world import world_of
+    from sfm_shapefit.files.colmap.world import world_of
     from sfm_shapefit.pipeline.write import refuse_file
 
     name = target_format or _format_of(path)
@@ -120,15 +121,15 @@ def write_converted(
     model = read_by_itself(source, with_lenses=name not in {"tum", "csv"})
     notes = model.notes
     centers = model.images.centers
-    world = world_of(given, centers, *coordinates)
-    told = world.statement
+    world = world_of(model_datum(given) if coordinates[0] else None, centers, *coordinates)
+    statement = world.statement
     if not (world.is_own or FORMATS[name].is_exact):
         model = read_model(transform_model(model.reconstruction, world.similarity(centers)))
-        told += world.bend_statement(centers)
-    told = "; ".join(filter(None, [told, *notes]))
+        statement += world.bend_statement(centers)
+    statement = "; ".join(filter(None, [statement, *notes]))
     if name in _FOLDERS:
         _write_folder(model, path, name, world, protect)
-        return Converted(name, (path,), told)
+        return Converted(name, (path,), statement)
     contents = _contents(name, _Scene(source, model, world, trust, path.stem))
     files = {
         path.with_name(path.stem + (tail if "." in tail else tail + path.suffix)): one
@@ -141,12 +142,10 @@ def write_converted(
     with ExitStack() as whole:  # all are written before the first is in its place
         for file, content in files.items():
             whole.enter_context(atomic_file(file)).write_bytes(content)
-    return Converted(name, tuple(files), told)
+    return Converted(name, tuple(files), statement)
 
 
 class _Scene(NamedTuple):
-    """What is written of a model."""
-
     source: "ModelSource"
     model: "ColmapModel"
     world: "World"
@@ -193,7 +192,6 @@ def _points_and_cameras(scene: _Scene) -> dict[str, bytes]:
 
 
 def _with_points(scene: _Scene) -> dict[str, bytes]:
-    """Return a transforms.json and the points that it names."""
     from sfm_shapefit.files.colmap.seed import pick_points
     from sfm_shapefit.files.nerf import nerf_text
     from sfm_shapefit.report.mesh import ply_bytes
@@ -204,21 +202,21 @@ def _with_points(scene: _Scene) -> dict[str, bytes]:
 
 
 def _covariances(scene: _Scene) -> str:
-    """Return the covariances of an output as a table."""
     from sfm_shapefit.facts.rows import covariances_text, read_covariances
 
     if not isinstance(scene.source, Path | str):
         raise InputError("covariances are those of the folder that locate or map wrote; give that")
     images = scene.model.images
-    found = read_covariances(Path(scene.source) / "covariances.csv")
+    covariances = read_covariances(Path(scene.source) / "covariances.csv")
     slopes = dict(zip(images.names, scene.world.slopes(images.centers), strict=True))
-    return covariances_text({k: slopes[k] @ one @ slopes[k].T for k, one in found.items() if k in slopes})
+    return covariances_text(
+        {k: slopes[k] @ one @ slopes[k].T for k, one in covariances.items() if k in slopes}
+    )
 
 
 def _write_folder(
     model: "ColmapModel", path: Path, name: str, world: "World", protect: Sequence[Path | str]
 ) -> None:
-    """Write a model as COLMAP has it, and the offset of its coordinates beside it."""
     from sfm_shapefit.files.colmap.seed import write_model
 
     if path.is_dir() and any(path.iterdir()):

@@ -55,24 +55,24 @@ def ask_pairs(
 
     Only pairs `among` some images are asked, by their index; None: all.
     """
-    asked = directions.pairs[_doubtful_pairs(directions, source.images.num_images)]
+    pairs = directions.pairs[_doubtful_pairs(directions, source.images.num_images)]
     if source.fixed is not None:
-        asked = asked[~source.fixed[asked].all(axis=1)]
+        pairs = pairs[~source.fixed[pairs].all(axis=1)]
     if among is not None:
-        asked = asked[np.isin(asked, among).all(axis=1)]
+        pairs = pairs[np.isin(pairs, among).all(axis=1)]
     are_many = have_many_pairs(source.images.num_images, len(directions.pairs))
-    return ask_rotations(source, asked, threads, directions if are_many else None)
+    return ask_rotations(source, pairs, threads, directions if are_many else None)
 
 
 def ask_rotations(
-    source: MatchSource, asked: IntArray, threads: int, given: PairDirections | None = None
+    source: MatchSource, pairs: IntArray, threads: int, given: PairDirections | None = None
 ) -> RelativeRotations:
     """Return the relative rotations that the matches of the asked pairs (k, 2) have by themselves.
 
     What pairs say alone, or else the `given` directions, those of many pairs, is tried first.
     """
     parts = []
-    for batch in source.view.of_pairs(asked):
+    for batch in source.view.of_pairs(pairs):
         rays = _thin(source.images, batch)
         likely = _poses_alone(source.alone, rays.pairs)
         if likely is None and given is not None:
@@ -108,12 +108,12 @@ def doubt_cameras(
     directions: PairDirections,
     relative: RelativeRotations | None,
     images: Images,
-    sure: BoolArray | None = None,
+    confirmed: BoolArray | None = None,
 ) -> Judged:
     """Return the placement with a trust that follows what the pairs say of the rotations.
 
     What `ask_pairs` returned is `relative`; if None, the given rotations are believed. Pairs of a model's own
-    tracks hold no second scene, and say nothing of cameras (k,) that are `sure`; None: pairs of a database.
+    tracks hold no second scene, and say nothing of `confirmed` cameras (k,); None: pairs of a database.
     """
     if relative is None:
         return replace(placement, assessment=believe_rotations(placement.assessment))
@@ -128,7 +128,7 @@ def doubt_cameras(
         _, labels = np.unique(placement.groups.group_of[placement.cameras], return_inverse=True)
     guesses = np.array([_is_guess(lens) for lens in images.lenses])[images.lens_of[placement.cameras]]
     doubts = replace(find_turned(pairs, labels), guessed=guesses)
-    doubts = doubts if sure is None else doubts.without(sure).without_repetition()
+    doubts = doubts if confirmed is None else doubts.without(confirmed).without_repetition()
     return replace(placement, assessment=weigh_doubts(placement.assessment, doubts))
 
 
@@ -188,7 +188,7 @@ def _thin(images: Images, batch: RayMatches) -> RayMatches:
     thin = batch.thinned(_MOST_MATCHES)
     turns = np.repeat(images.rotations[thin.pairs], np.diff(thin.offsets), axis=0)
     rays_i, rays_j = (
-        np.einsum("kab,kb->ka", turns[:, side], own) for side, own in enumerate((thin.rays_i, thin.rays_j))
+        np.einsum("kab,kb->ka", turns[:, side], rays) for side, rays in enumerate((thin.rays_i, thin.rays_j))
     )
     return replace(thin, rays_i=rays_i, rays_j=rays_j)
 

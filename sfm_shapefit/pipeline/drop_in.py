@@ -6,14 +6,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
-from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.components import start_run
 from sfm_shapefit.pipeline.map import map_database, measure_run
-from sfm_shapefit.pipeline.mapping import start_run
 from sfm_shapefit.pipeline.write import WriteOptions, deliver
 from sfm_shapefit.scene.points import number_points
 
@@ -63,12 +63,12 @@ def global_mapping(
 def _options_of(theirs: "pycolmap.GlobalPipelineOptions") -> MapOptions:
     """Return the options of pycolmap that have a counterpart, where they are not its defaults."""
     usual = type(theirs)()
-    told = {
+    values = {
         ours: getattr(theirs, name)
         for name, ours in _TAKEN.items()
         if getattr(theirs, name, None) != getattr(usual, name, None)
     }
-    return MapOptions(**told)
+    return MapOptions(**values)
 
 
 def average_database(
@@ -99,7 +99,7 @@ def average_database(
         UnsolvableError: if no three images have rotations that agree.
     """
     options = merge_options(options, MapOptions, overrides)
-    clock = Clock.of(progress, options.placement.solver, executor)
+    clock = Clock.of(progress, options.placement.solver.threads, executor)
     with closing(DatabaseFile(database_in(Path(database)))) as file:
         run, relative, *_ = measure_run(start_run(file, options, clock, None))
         reasons: dict[int, str] = {}

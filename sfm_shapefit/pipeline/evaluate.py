@@ -1,25 +1,15 @@
 """`evaluate`: a model's poses against a reference."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from sfm_shapefit.base.atomic_folder import MARKER
-from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.tables import model_datum
 from sfm_shapefit.files.colmap.listed_poses import is_list, read_by_itself
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.priors import in_meters, read_positions
-from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.files.listed_names import named_as
-from sfm_shapefit.scene.evaluation import (
-    Evaluation,
-    PositionEvaluation,
-    evaluate_poses,
-    evaluate_positions,
-)
-from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.evaluation import Evaluation, PositionEvaluation, evaluate_poses, evaluate_positions
 from sfm_shapefit.scene.pose_errors import NamedPoses
 
 
@@ -52,8 +42,8 @@ def evaluate(
         poses = poses._replace(names=named_as(Path(reconstruction), poses.names, truth.names))
     elif isinstance(reference, Path | str) and is_list(reference):
         truth = truth._replace(names=named_as(Path(reference), truth.names, poses.names))
-    found = evaluate_poses(poses, truth, thresholds, trajectory=trajectory)
-    return replace(found, warnings=(*read[0].notes, *read[1].notes, *found.warnings))
+    evaluation = evaluate_poses(poses, truth, thresholds, trajectory=trajectory)
+    return replace(evaluation, warnings=(*read[0].notes, *read[1].notes, *evaluation.warnings))
 
 
 def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEvaluation:
@@ -83,18 +73,3 @@ def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEval
         "; ".join([statement, *known.notes]),
         as_they_stand=datum is not None or not is_geodetic,
     )
-
-
-def model_datum(model: Any) -> Datum | None:
-    """Return the datum of a result, or that in locate.json beside a model; None without."""
-    if not isinstance(model, Path | str):
-        known = getattr(getattr(model, "facts", None), "datum", None)
-        return known and Datum(known.latitude_deg, known.longitude_deg, known.altitude_m)
-    file = Path(model) / MARKER
-    if not file.is_file():
-        return None
-    try:
-        found = json.loads(text_of(file)).get("datum")
-        return None if found is None else Datum(**found)
-    except (ValueError, TypeError, AttributeError) as error:
-        raise InputError(f"{file} cannot be read; run locate again, or remove it") from error

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit import synthetic
+from sfm_shapefit import evaluate, inspect, locate, map_database, place, relative_rotations, solve, synthetic
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom
@@ -25,13 +25,7 @@ from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import widest_level
 from sfm_shapefit.pairs.triplets import score_triplets
-from sfm_shapefit.pipeline.adjust import read_bundle
-from sfm_shapefit.pipeline.evaluate import evaluate
-from sfm_shapefit.pipeline.inspect import inspect
-from sfm_shapefit.pipeline.locate import locate
-from sfm_shapefit.pipeline.map import map_database
-from sfm_shapefit.pipeline.place import place
-from sfm_shapefit.pipeline.relative_rotations import relative_rotations
+from sfm_shapefit.pipeline.bundle_adjust import read_bundle
 from sfm_shapefit.refinement.angular import allocate_normal, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rotations.annealing import anneal, follow_spanning_tree, refine_fully
@@ -42,7 +36,6 @@ from sfm_shapefit.rotations.dual_certificate import certify_rotations
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.solver.newton.dense import solve_newton_dense
 from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
-from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions

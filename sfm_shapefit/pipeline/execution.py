@@ -19,9 +19,9 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import MissingExtraError
 from sfm_shapefit.base.executors import Answer, WorkerError, answers
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.scene.matches import MatchBatch, MatchPart, View
 
 MATCHES_PER_TASK = 1_000_000
@@ -46,14 +46,14 @@ def measure_with_workers(
         InputError: as a worker found the database.
     """
     assert clock.executor is not None
-    found: list[Answer] = []
+    results: list[Answer] = []
     done = 0
     work = partial(measure_part, estimate, min_matches)
     for part, measured in answers(clock.executor, work, view.parts(matches_per_task)):
-        found += measured
+        results += measured
         done += part.num_pairs
         clock.advance(done, view.num_pairs)
-    return found
+    return results
 
 
 def measure_part(estimate: Callable[[MatchBatch], Answer], min_matches: int, part: MatchPart) -> list[Answer]:
@@ -97,11 +97,11 @@ def _interrupts_wait() -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _frame: came.append(number))
+    handler = signal.signal(signal.SIGINT, lambda number, _frame: came.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, handler)
     if came:
         raise KeyboardInterrupt
 

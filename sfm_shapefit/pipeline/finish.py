@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, hand_back_memory
-from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1
+from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, turned_deg
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
 from sfm_shapefit.facts.result import NO_POINTS, LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
@@ -23,11 +24,9 @@ from sfm_shapefit.facts.warnings import (
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.judgement.uncertainty import standard_deviations
-from sfm_shapefit.pipeline.adjustment import turned_deg
-from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, gauge_rule
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, coincide
+from sfm_shapefit.placement.gauge_rule import SETS_SCALE
 from sfm_shapefit.placement.prior_fit import PriorFit, compare_with_priors
 
 
@@ -39,7 +38,7 @@ def finish_model(state: ModelState, clock: Clock) -> LocateResult:
         seed = SeededModel.of(_resize_sensors(state), state.images, state.points, keypoints)
         hand_back_memory()  # freed by the judgement; the files of a model take as much
     done = [one for one in (state.first, state.adjustment, state.bundle) if one]
-    found = LocateResult(
+    result = LocateResult(
         seed=seed,
         inputs=source.inputs,
         options=inputs.options,
@@ -67,19 +66,19 @@ def finish_model(state: ModelState, clock: Clock) -> LocateResult:
         control_points=state.control,
         suspicions=state.reasons,
     )
-    found = replace(found, warnings=tuple(_warnings(found, state)))
-    return found if inputs.rough_rad is None else _compare_with_rough(found, state, inputs.rough_rad)
+    result = replace(result, warnings=tuple(_warnings(result, state)))
+    return result if inputs.rough_rad is None else _compare_with_rough(result, state, inputs.rough_rad)
 
 
 def _resize_sensors(state: ModelState) -> Template:
     """Return the template with sensors that are no cameras in the scale of the output, if that is another."""
     template, given = state.inputs.template, state.inputs.images
-    there = state.images.is_posed & given.is_posed
-    before, now = given.centers[there], state.images.centers[there]
+    posed = state.images.is_posed & given.is_posed
+    old, new = given.centers[posed], state.images.centers[posed]
     keeps = state.gauge.scale in ("input", "rig", "fixed") or not template.has_open_sensors
-    if keeps or len(before) < FEWEST_PRIORS or coincide(before):
+    if keeps or len(old) < FEWEST_PRIORS or coincide(old):
         return template
-    return template.resized(fit_similarity_l1(before, now).scale)
+    return template.resized(fit_similarity_l1(old, new).scale)
 
 
 def _compare_with_priors(state: ModelState) -> PriorFit | None:
@@ -88,50 +87,50 @@ def _compare_with_priors(state: ModelState) -> PriorFit | None:
     if priors is None or not gauge.has_priors:
         return None
     directions = pairs.directions if gauge.axes is None else pairs.directions @ gauge.axes.T
-    sigmas, own = np.full(state.images.num_images, np.nan), standard_deviations(judged.covariances)
-    sigmas[judged.cameras] = gauge.similarity.scale * own.max(axis=1)
+    sigmas, axis_sigmas = np.full(state.images.num_images, np.nan), standard_deviations(judged.covariances)
+    sigmas[judged.cameras] = gauge.similarity.scale * axis_sigmas.max(axis=1)
     return compare_with_priors(state.images.centers, sigmas, priors, pairs.pairs, directions)
 
 
-def _warnings(found: LocateResult, state: ModelState) -> Iterator[str]:
+def _warnings(result: LocateResult, state: ModelState) -> Iterator[str]:
     """Yield what the user should know of a finished piece beyond the tables: what speaks against it first."""
-    images, options, gauge = found.placed, found.options, found.gauge
-    yield from found.told_evidence.statements
-    yield from intrinsics_warnings(found.intrinsics.rows(images))
+    images, options, gauge = result.placed, result.options, result.gauge
+    yield from result.told_evidence.statements
+    yield from intrinsics_warnings(result.intrinsics.rows(images))
     yield from match_warnings(state.directions, may_repeat=state.source.has_database)
-    yield from quality_warnings(found.placement, options.placement)
-    yield from trust_warnings(found.placement, found.kept)
-    yield from ambiguity_warnings(found.placement)
-    if found.model.num_points3D() == 0:
+    yield from quality_warnings(result.placement, options.placement)
+    yield from trust_warnings(result.placement, result.kept)
+    yield from ambiguity_warnings(result.placement)
+    if result.model.num_points3D() == 0:
         yield f"{NO_POINTS}; bundle adjustment has nothing to start from"
-    yield from prior_warnings(found.prior_fit, images.names)
-    there = np.flatnonzero(images.is_posed)
-    yield from gauge_rule(state).check(gauge, there, images.centers[there])
+    yield from prior_warnings(result.prior_fit, images.names)
+    posed = np.flatnonzero(images.is_posed)
+    yield from state.gauge_rule.check(gauge, posed, images.centers[posed])
     if options.gauge.scale == "unit" and gauge.scale != "unit":
         yield f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}"
-    unsupported = [images.names[k] for k in np.flatnonzero(found.unsupported).tolist()]
+    unsupported = [images.names[k] for k in np.flatnonzero(result.unsupported).tolist()]
     yield from support_warnings(unsupported, is_kept=options.trust.min_trust == 0.0)
     yield from state.warnings
 
 
-def _compare_with_rough(found: LocateResult, state: ModelState, sigma_rad: float) -> LocateResult:
+def _compare_with_rough(result: LocateResult, state: ModelState, sigma_rad: float) -> LocateResult:
     """Return a piece with how far images were turned and moved from where they roughly were."""
-    given, images, sigma_deg = state.inputs.images, found.images, float(np.degrees(sigma_rad))
-    there = np.isfinite(found.placed.centers).all(axis=1)
-    common = mean_rotation_l1(given.rotations[there].transpose(0, 2, 1) @ images.rotations[there])
-    turned = np.where(there, turned_deg(given.rotations @ common, images.rotations), np.nan)
-    found = replace(found, turned_deg=turned, moved=_moved(given.centers, found.placed.centers))
-    if found.placement.piece:
-        return found
-    suspicions = (*found.suspicions, *rotation_suspicions(turned, sigma_deg))
+    given, images, sigma_deg = state.inputs.images, result.images, float(np.degrees(sigma_rad))
+    posed = np.isfinite(result.placed.centers).all(axis=1)
+    common = mean_rotation_l1(given.rotations[posed].transpose(0, 2, 1) @ images.rotations[posed])
+    turned = np.where(posed, turned_deg(given.rotations @ common, images.rotations), np.nan)
+    result = replace(result, turned_deg=turned, moved=_moved(given.centers, result.placed.centers))
+    if result.placement.piece:
+        return result
+    suspicions = (*result.suspicions, *rotation_suspicions(turned, sigma_deg))
     wrong = rotation_warnings(turned, given.names, sigma_deg)
-    return replace(found, suspicions=suspicions, warnings=(*wrong, *found.warnings))
+    return replace(result, suspicions=suspicions, warnings=(*wrong, *result.warnings))
 
 
 def _moved(given: FloatArray, placed: FloatArray) -> FloatArray | None:
     """Return how far centers (n, 3) are from the given ones; None if these are no places."""
-    there = np.isfinite(placed).all(axis=1) & np.isfinite(given).all(axis=1)
-    if coincide(given[there]):
+    common = np.isfinite(placed).all(axis=1) & np.isfinite(given).all(axis=1)
+    if coincide(given[common]):
         return None
-    motion = fit_similarity_l1(given[there], placed[there])
+    motion = fit_similarity_l1(given[common], placed[common])
     return np.asarray(np.linalg.norm(motion.apply(given) - placed, axis=1))

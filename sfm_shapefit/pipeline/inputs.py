@@ -14,7 +14,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, intrinsics_in_doubt
-from sfm_shapefit.facts.options import InspectOptions, PlacingOptions, Source
+from sfm_shapefit.facts.options import PlacingOptions, Source
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, open_database
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
@@ -28,7 +28,7 @@ from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.files.pair_list import read_pair_list
 from sfm_shapefit.pairs.focal_lengths import find_lenses
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.memory import ECONOMIES, Economy, Workload, choose_economy
+from sfm_shapefit.placement.memory_plan import MEMORY_PLANS, MemoryPlan
 from sfm_shapefit.placement.options import KnownDistance, Scale
 from sfm_shapefit.scene.freedom import PARTS_FREED, IntrinsicsFreedom
 from sfm_shapefit.scene.given import NOTHING_KNOWN, Known
@@ -45,13 +45,13 @@ class MatchSource:
     view: View
     """How the images see them, but for the pairs that are left out."""
     inputs: Inputs
-    economy: Economy = ECONOMIES[0]
+    memory_plan: MemoryPlan = MEMORY_PLANS[0]
     fixed: BoolArray | None = None
     """(i,) images that stay where they are; None if none does."""
     tied: IntArray | None = None
-    """(k, 2) images that joins of models, or position priors, tie to one another; None if these do not."""
+    """(k, 2) images that stand rightly to one another by joins of models or position priors; None without."""
     alone: RelativeRotations | None = None
-    """What pairs, ascending, said of their rotations alone, before anything was placed; None if not asked."""
+    """Relative rotations of pairs, ascending, by their matches alone; None where they were not measured."""
 
     @property
     def images(self) -> Images:
@@ -70,33 +70,19 @@ class MatchSource:
             return None
         return np.asarray(self.view.pairs[self.fixed[self.view.pairs].all(axis=1)])
 
-    def at(self, images: Images, economy: Economy | None = None) -> "MatchSource":
+    def at(self, images: Images, memory_plan: MemoryPlan | None = None) -> "MatchSource":
         """Return the same matches as other images see them, or with more that is given up."""
-        economy = economy or self.economy
-        if images is self.images and economy is self.economy:
+        memory_plan = memory_plan or self.memory_plan
+        if images is self.images and memory_plan is self.memory_plan:
             return self
-        view = self.matches.at(images, self.inputs.left_out, economy.reading)
-        return replace(self, view=view, economy=economy)
+        view = self.matches.at(images, self.inputs.left_out, memory_plan.reading)
+        return replace(self, view=view, memory_plan=memory_plan)
 
     def without(self, pairs: PairNames) -> "MatchSource":
         """Return the same matches without those of some pairs."""
         inputs = replace(self.inputs, left_out=self.inputs.left_out | pairs, far=self.inputs.far - pairs)
-        view = self.matches.at(self.images, inputs.left_out, self.economy.reading)
+        view = self.matches.at(self.images, inputs.left_out, self.memory_plan.reading)
         return replace(self, inputs=inputs, view=view)
-
-    def workload(self, options: PlacingOptions | InspectOptions) -> Workload:
-        """Return what is known of the work before any direction is measured."""
-        view, num_images = self.view, self.images.num_images
-        return Workload(
-            num_images=num_images,
-            num_keypoints=self.matches.total_keypoints,
-            num_pairs=view.num_pairs,
-            num_matches=view.num_matches,
-            num_edges=view.num_pairs,
-            num_nodes=num_images,
-            adjusts=options.placement.refines and options.freedom.adjusts_cameras(num_images),
-            adjusts_bundle=options.freedom.adjust == "full",
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -178,26 +164,17 @@ def open_verified(database: Path, names: Sequence[str]) -> DatabaseMatches:
     return matches
 
 
-def see_matches(
-    matches: Matches, images: Images, inputs: Inputs, options: PlacingOptions | None = None
-) -> MatchSource:
-    """Return the matches as images see them; without options memory has no limit."""
-    source = MatchSource(matches=matches, view=matches.at(images, inputs.left_out), inputs=inputs)
-    if options is None or not options.memory.max_memory_mb or not source.has_database:
-        return source
-    bare = source.workload(options)
-    work = replace(bare, has_points=options.nodes.uses_points(images.num_images))
-    return source.at(images, choose_economy(work, bare, options.memory.max_memory_mb))
+def see_matches(matches: Matches, images: Images, inputs: Inputs) -> MatchSource:
+    """Return the matches as images see them, with no limit of memory."""
+    return MatchSource(matches=matches, view=matches.at(images, inputs.left_out), inputs=inputs)
 
 
 @contextmanager
-def open_source(
-    model: ColmapModel, inputs: Inputs, options: PlacingOptions | None = None
-) -> Iterator[MatchSource]:
+def open_source(model: ColmapModel, inputs: Inputs) -> Iterator[MatchSource]:
     """Open the matches that were chosen, as `see_matches` sees them, and close them in the end."""
     opened, inputs = open_matches(model, inputs)
     with closing(opened) as matches:
-        yield see_matches(matches, model.images, inputs, options)
+        yield see_matches(matches, model.images, inputs)
 
 
 def read_left_out(inputs: Inputs, names: Collection[str], without: str) -> Inputs:
@@ -227,8 +204,8 @@ def choose_inputs(
         return Inputs(folder=folder, database=None, statement="the model's own tracks, as asked")
     # The pixels of other programs' model files may differ from those of a database beside them.
     is_folder = folder is not None and not folder.is_file()
-    found = find_database(folder) if folder is not None and is_folder else None
-    path = Path(database) if database is not None else found
+    nearby = find_database(folder) if folder is not None and is_folder else None
+    path = Path(database) if database is not None else nearby
     if path is None:
         if source != "auto":
             raise InputError(f"directions from {source} need a database; give one (database=FILE)")
@@ -250,7 +227,7 @@ _UNLIKE = 1.1  # factor; pairs that agree scatter by a third of that
 _MOST_OFF = 4.0  # factor; a view graph that wants a larger one says more of itself than of the lens
 
 
-def settle_intrinsics(
+def choose_intrinsics(
     images: Images,
     matches: DatabaseMatches | TrackMatches,
     wanted: IntrinsicsFreedom,
@@ -269,10 +246,10 @@ def settle_intrinsics(
         lenses = [lens if lens.is_panorama else lens.in_doubt(Origin.CALIBRATION) for lens in lenses]
     for k in (k for k, lens in enumerate(images.lenses) if lens.id in listed):
         lenses[k] = images.lenses[k].in_doubt(Origin.GUESS)
-    for k, found in guessed.items():
-        lenses[k] = images.lenses[k].in_doubt(found.origin)
-    asked = [found.database_id for found in guessed.values()]
-    by_pairs = read_pair_focals(file, asked, left_out) if file is not None and asked else {}
+    for k, guess in guessed.items():
+        lenses[k] = images.lenses[k].in_doubt(guess.origin)
+    database_ids = [guess.database_id for guess in guessed.values()]
+    by_pairs = read_pair_focals(file, database_ids, left_out) if file is not None and database_ids else {}
     if file is not None and guessed and wanted != "held":
         doubted = np.isin(np.arange(len(lenses)), list(guessed))
         by_rays = doubted & [lens.is_adjustable and not lens.is_plane for lens in lenses]
@@ -300,38 +277,38 @@ def _by_view_graph(
     left_out: PairNames,
 ) -> FloatArray:
     """Return by which factor each lens (l,) is to be longer, 1 where no pair says."""
-    others = [found.database_id for k, found in guessed.items() if not by_rays[k]]
+    others = [guess.database_id for k, guess in guessed.items() if not by_rays[k]]
     by_database = calibrate_view_graph(file, others, left_out) if others else {}
     for i, one in by_pairs.items():
         known = by_database.get(i)
         if known is None or (one.is_one_sided and not 1.0 / _ALIKE < one.factor / known < _ALIKE):
             by_database[i] = one.factor
     factors = np.ones(len(by_rays))
-    for k, found in guessed.items():
-        factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
+    for k, guess in guessed.items():
+        factors[k] = by_database.get(guess.database_id, 1.0 / guess.ratio) * guess.ratio
     factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
     return factors
 
 
 def _contradicted_guesses(
-    before: Sequence[Lens],
+    as_read: Sequence[Lens],
     lenses: Sequence[Lens],
     guessed: Mapping[int, Uncalibrated],
     by_pairs: Mapping[int, PairFocal],
 ) -> Iterator[str]:
     """Yield which lenses start from another focal length than their pairs were verified with, if any do."""
-    told = []
-    for k, found in guessed.items():
-        if found.database_id not in by_pairs:
+    named = []
+    for k, guess in guessed.items():
+        if guess.database_id not in by_pairs:
             continue
-        one, focal_px = by_pairs[found.database_id], lenses[k].focal_px
-        asked_px = before[k].focal_px * one.factor * found.ratio
+        one, focal_px = by_pairs[guess.database_id], lenses[k].focal_px
+        asked_px = as_read[k].focal_px * one.factor * guess.ratio
         if not 1.0 / _UNLIKE < asked_px / focal_px < _UNLIKE:
-            told.append(
+            named.append(
                 f"{one.num_pairs} of camera {lenses[k].id} with {asked_px:,.0f} px, not {focal_px:,.0f}"
             )
-    if told:
+    if named:
         yield (
             "COLMAP verified pairs with other focal lengths than their guessed lenses start from: "
-            f"{first_of(told)}; intrinsics=auto lets these change"
+            f"{first_of(named)}; intrinsics=auto lets these change"
         )

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.inspected import Inspection
@@ -11,14 +12,14 @@ from sfm_shapefit.files.colmap.listed_poses import is_list, read_source
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.conventions import naming_convention
 from sfm_shapefit.pipeline.doubts import confirm_rotations
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
-from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, count_work, measure, wants_points
-from sfm_shapefit.pipeline.memory import describe_work, forecast
-from sfm_shapefit.pipeline.rigs import find_rigid_parts, rigs_statement
+from sfm_shapefit.pipeline.measure import MeasureRequest, add_evidence, build_graph, measure, wants_points
+from sfm_shapefit.pipeline.memory import count_work, describe_work, forecast
+from sfm_shapefit.pipeline.placing import rigs_statement
 from sfm_shapefit.placement.diagnosis import diagnose
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 
 
 def inspect(
@@ -58,7 +59,7 @@ def inspect(
             points="no: a bare graph has no matches",
             diagnosis=diagnose(graph, options.placement),
         )
-    clock = Clock.of(progress, options.placement.solver)
+    clock = Clock.of(progress, options.placement.solver.threads)
     with clock("read"):
         model, _ = read_source(source, database, rotations_suffice=True)
         inputs = choose_inputs(source, database, options.source.directions)
@@ -66,12 +67,12 @@ def inspect(
     images = model.images
     with open_source(model, inputs) as matches:
         with clock("directions"):
-            wanted = Wanted(tracks=wants_points(matches, options.nodes))
+            wanted = MeasureRequest(tracks=wants_points(matches, options.nodes))
             measured = measure(matches, options.directions, clock, wanted)
             directions = measured.directions
         with clock("diagnosis"), naming_convention(matches, clock.threads):
             with_points = add_evidence(build_graph(images, measured, options.nodes), measured)
-            grouped = find_rigid_parts(images).apply(with_points)
+            grouped = find_fixed_and_rigged(images).apply(with_points)
             work = describe_work(grouped, count_work(matches, directions, options), options.placement)
             confirmed = confirm_rotations(matches, directions, clock.threads)
             return Inspection(
@@ -80,7 +81,7 @@ def inspect(
                 statuses={status.value: count for status, count in directions.counts().items()},
                 points=options.nodes.points_statement(images.num_images, with_points.num_points),
                 diagnosis=diagnose(with_points, options.placement, confirmed),
-                expected=forecast(work, matches.economy),
+                expected=forecast(work, matches.memory_plan),
                 rigs=rigs_statement(images, grouped),
                 warnings=(*model.notes, *matches.matches.notes),
             )

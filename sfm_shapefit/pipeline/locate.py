@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
@@ -19,20 +19,18 @@ from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.listed_poses import read_source
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.template import template_of
-from sfm_shapefit.pipeline.adjustment import pull_of_rotations
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
-from sfm_shapefit.pipeline.gauge_choice import between_images, read_known
 from sfm_shapefit.pipeline.inputs import (
     RunInputs,
     choose_inputs,
+    choose_intrinsics,
     open_matches,
     read_left_out,
     see_matches,
-    settle_intrinsics,
 )
+from sfm_shapefit.pipeline.known import between_images, pull_of_rotations, read_fixed_images, read_known
+from sfm_shapefit.pipeline.memory import see_within_limit
 from sfm_shapefit.pipeline.remedies import make_model
-from sfm_shapefit.pipeline.rigs import read_fixed_images
 
 _ROUGH_RAD = np.radians(0.3)  # radians; directions of pairs are not measured by rotations farther off
 _NOT_CORRECTED = "rough rotations beside fixed images are not corrected; --fix needs better ones"
@@ -83,7 +81,7 @@ def locate(
     Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """
     options = merge_options(options, LocateOptions, overrides)
-    clock = Clock.of(progress, options.placement.solver, executor)
+    clock = Clock.of(progress, options.placement.solver.threads, executor)
     with ExitStack() as stack:
         with clock("read"):
             model, listed = read_source(reconstruction, database, rotations_suffice=True)
@@ -97,19 +95,19 @@ def locate(
             opened, inputs = open_matches(model, inputs)
             matches = stack.enter_context(closing(opened))
             wanted = options.freedom.intrinsics
-            images, intrinsics = settle_intrinsics(given, matches, wanted, inputs.left_out, listed)
+            images, intrinsics = choose_intrinsics(given, matches, wanted, inputs.left_out, listed)
             known = read_known(images, matches.file, priors, options.gauge.control_points)
             fixed = read_fixed_images(model, options.fix)
             has_database = matches.file is not None
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)
             notes = (*model.notes, *matches.notes)
             del model  # whose points and keypoints are large
-            source = see_matches(matches, images, inputs, options)
+            source = see_within_limit(see_matches(matches, images, inputs), options)
         pull_rad = pull_of_rotations(options.rotations)
         is_rough = pull_rad is not None and _ROUGH_RAD <= pull_rad < np.inf
         if is_rough and fixed.any():
             is_rough, notes = False, (_NOT_CORRECTED, *notes)
-        told = RunInputs(
+        run_inputs = RunInputs(
             options=options,
             template=template,
             images=images,
@@ -122,5 +120,5 @@ def locate(
             known=known,
         )
         with naming_convention(source, clock.threads):
-            found = tell_convention(make_model(told, source, clock), source, clock.threads)
-        return replace(found, warnings=(*notes, *found.warnings)) if notes else found
+            result = tell_convention(make_model(run_inputs, source, clock), source, clock.threads)
+        return replace(result, warnings=(*notes, *result.warnings)) if notes else result

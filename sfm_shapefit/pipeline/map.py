@@ -11,6 +11,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.map_result import MapResult, tell_joins
@@ -20,9 +21,8 @@ from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.pipeline.join import join_mapped
-from sfm_shapefit.pipeline.mapping import MapRun, locate_components, refine_intrinsics, start_run
+from sfm_shapefit.pipeline.components import MapContext, start_run
+from sfm_shapefit.pipeline.mapping import join_mapped, locate_components, refine_intrinsics
 from sfm_shapefit.rotations.sequences import Videos, Visit
 from sfm_shapefit.scene.lens import FOCAL
 
@@ -63,7 +63,7 @@ def map_database(
         WorkerError: if a worker died and the executor does not replace it.
     """
     options = merge_options(options, MapOptions, overrides)
-    clock = Clock.of(progress, options.placement.solver, executor)
+    clock = Clock.of(progress, options.placement.solver.threads, executor)
     with closing(DatabaseFile(database_in(Path(database)))) as file:
         return map_opened(file, options, clock, priors)
 
@@ -80,7 +80,7 @@ def map_opened(
     if not models:
         raise UnsolvableError(_explain_failure(file, relative, reasons))
     with clock("join") if options.join == "safe" else nullcontext():
-        joins, joined, told = join_mapped(models, run)
+        joins, joined, join_warnings = join_mapped(models, run)
     left_out = {**run.read.left_out} | {
         name: reasons[frame]
         for name, frame in zip(run.images.names, run.frame_of_image.tolist(), strict=True)
@@ -101,14 +101,14 @@ def map_opened(
             *file.notes,
             *(run.known.priors.notes if run.known.priors is not None else ()),
             *map_warnings(run.read.rigs.incomplete, models, left_out),
-            *told,
+            *join_warnings,
             *lost_distances(run.options.gauge.known_distance, models, joined),
         ),
     )
     return tell_joins(result)
 
 
-def measure_run(run: MapRun) -> tuple[MapRun, RelativeRotations, Videos, tuple[Visit, ...]]:
+def measure_run(run: MapContext) -> tuple[MapContext, RelativeRotations, Videos, tuple[Visit, ...]]:
     """Return the relative rotations of all pairs that are believed, videos, and visits.
 
     The run knows scores of the pairs then, and which ones are refused.
@@ -126,7 +126,6 @@ def measure_run(run: MapRun) -> tuple[MapRun, RelativeRotations, Videos, tuple[V
 
 
 def _explain_failure(file: DatabaseFile, relative: RelativeRotations, reasons: dict[int, str]) -> str:
-    """Say why no component could be placed."""
     if len(relative.pairs) == 0:
         return explain_no_pairs(file) or (
             f"no pair of images in {file.path} has {LEAST_MATCHES} inlier matches and a relative rotation; "

@@ -1,328 +1,61 @@
-"""`map` from images to models: what all components have in common, their averaged rotations, their models.
-
-Frames that the averaging of a component drops are grouped anew by the pairs among themselves.
-"""
+"""`map` from averaged rotations to models: one of each component, and those that belong together joined."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.forests import connected_components
-from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
-from sfm_shapefit.facts.map_result import MappedModel
-from sfm_shapefit.facts.options import MapOptions
-from sfm_shapefit.facts.result import Inputs, LocateResult
+from sfm_shapefit.base.settings import flat_values
+from sfm_shapefit.facts.joins import Joined
+from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
+from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.scene import Loop
-from sfm_shapefit.files.colmap.database import DatabaseMatches
-from sfm_shapefit.files.colmap.database_images import UnposedImages, read_images
-from sfm_shapefit.files.colmap.database_pairs import refuse_no_features
-from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
-from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
-from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pairs.triplets import score_triplets
-from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.gauge_choice import between_images, read_known
-from sfm_shapefit.pipeline.inputs import (
-    MatchSource,
-    RunInputs,
-    inputs_from,
-    read_left_out,
-    see_matches,
-    settle_intrinsics,
-)
-from sfm_shapefit.pipeline.relative_rotations import measure_rotations
+from sfm_shapefit.pipeline.components import MapContext, pairs_among
+from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, see_matches
+from sfm_shapefit.pipeline.memory import see_within_limit
+from sfm_shapefit.pipeline.model_joins import JoinInputs, judge_joins, merge_groups, tell_group
+from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.remedies import at_one_center, make_model
 from sfm_shapefit.pipeline.starts import adjust_first_placement
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.place import ContradictedOffsetsError
-from sfm_shapefit.rotations.arrangements import agreeing_pairs, choose_arrangement, evidence_of
-from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
+from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
-from sfm_shapefit.rotations.frames import relative_rotations_of_frames
-from sfm_shapefit.rotations.options import AveragingOptions
-from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
-from sfm_shapefit.scene.given import Gravity, Known
+from sfm_shapefit.rotations.sequences import Visit
+from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import PairNames, View, rows_of_pairs
-
-_MOST_SCORED_PAIRS = 20_000  # pairs; scores of more are not worth 0.2 ms a pair and 16 bytes a match
+from sfm_shapefit.scene.matches import PairNames
 
 
-class PairScores(NamedTuple):
-    """Scores of pairs with a relative rotation, by which those of repeated structure are told."""
-
-    pairs: IntArray = np.zeros((0, 2), dtype=np.int64)
-    """(m, 2)"""
-    values: FloatArray = np.zeros((0, 2))
-    """(m, 2) by triangles, and the matched share of their overlap; NaN where unknown."""
-
-    def of(self, pairs: IntArray) -> FloatArray:
-        """Return those of some pairs (k, 2), (k, 2)."""
-        return np.vstack([self.values, [np.nan, np.nan]])[rows_of_pairs(pairs, self.pairs)]
-
-
-def start_run(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | None) -> "MapRun":
-    """Read what a run works from: the database, and the files that the options name."""
-    path = file.path
-    with clock("read"):
-        refuse_no_features(file)
-        read = read_images(file)
-        images = read.images
-        if options.freedom.rigs == "free" and not images.has_rigs:
-            raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
-        inputs = read_left_out(inputs_from(path), images.names, options.directions.without)
-        matches = DatabaseMatches(file, images.names)
-        images, intrinsics = settle_intrinsics(images, matches, options.freedom.intrinsics, inputs.left_out)
-        gauge = between_images(options.gauge, images.names, "the database has no image")
-        known = read_known(images, file, priors, options.gauge.control_points, options.averaging.gravity)
-    return MapRun(
-        options=replace(options, gauge=gauge),
-        clock=clock,
-        matches=matches,
-        read=read,
-        images=images,
-        intrinsics=intrinsics,
-        known=known,
-        without=inputs.left_out,
-    )
-
-
-class MapRun(NamedTuple):
-    """What all components of a run have in common; the clock adds up the time that they take."""
-
-    options: MapOptions
-    clock: Clock
-    matches: DatabaseMatches
-    read: UnposedImages
-    images: Images
-    """All of the database, at the origin."""
-    intrinsics: RefinedIntrinsics
-    """Which of theirs are in doubt."""
-    known: Known
-    without: PairNames
-    """Pairs that are taken for unmatched."""
-    scores: PairScores = PairScores()
-    """Scores of pairs of images."""
-
-    def measure(self) -> RelativeRotations:
-        """Return the relative rotations of all pairs, by the intrinsics that the images have."""
-        with self.clock("relative rotations"):
-            return measure_rotations(self.view(), LEAST_MATCHES, self.clock)
-
-    def view(self) -> View:
-        """Return the matches of all images in axes of their cameras, but for the pairs that are left out."""
-        return self.matches.at(self.images.apart(), self.without)
-
-    def find_videos(self, relative: RelativeRotations) -> Videos:
-        """Return the videos among the images, as far as the options want to know of them."""
-        asked = self.options.averaging.sequence
-        nothing = Videos(np.full(self.images.num_images, -1), np.full(self.images.num_images, -1))
-        videos = nothing if asked == "none" else find_videos(self.images.names)
-        return confirm_videos(videos, relative) if asked == "auto" else videos
-
-    def judge_loops(
-        self, videos: Videos, relative: RelativeRotations
-    ) -> tuple["MapRun", RelativeRotations, tuple[Visit, ...]]:
-        """Return run and pairs without loop pairs that the chains of their videos contradict, and visits."""
-        if not videos.num_videos:
-            return self, relative, ()
-        with self.clock("rotation averaging"):
-            loops = judge_loops(videos, relative, self.clock.threads)
-        names = self.images.names
-        refused = {(names[i], names[j]) for i, j in relative.pairs[loops.refused].tolist()}
-        kept = np.delete(np.arange(len(relative.pairs)), loops.refused)
-        without = self.without | {(min(pair), max(pair)) for pair in refused}
-        return self._replace(without=without), relative.subset(kept), loops.visits
-
-    def score_pairs(self, relative: RelativeRotations) -> "MapRun":
-        """Return the run with the scores by which pairs of repeated structure are told."""
-        scores = np.full((len(relative.pairs), 2), np.nan)
-        scores[:, 0] = score_triplets(self.images.num_images, relative)
-        if len(scores) <= _MOST_SCORED_PAIRS:
-            with self.clock("scores of pairs"):
-                view = self.view()
-                pixels = [view.keypoints(k) for k in range(self.images.num_images)]
-                sizes = self.images.sizes_px
-                batches = list(view.links(LEAST_MATCHES))  # both look at all of them
-                partners = count_partners([len(own) for own in pixels], batches)
-                for batch in batches:
-                    rows = rows_of_pairs(batch.pairs, relative.pairs)
-                    scores[rows[rows >= 0], 1] = matched_shares(pixels, sizes, partners, batch)[rows >= 0]
-        return self._replace(scores=PairScores(relative.pairs, scores))
-
-    def average_images(
-        self, relative: RelativeRotations, reasons: dict[int, str]
-    ) -> Iterator[tuple[IntArray, IntArray, AveragedRotations]]:
-        """Yield the frames of each component, and its images with their rotations."""
-        of_image, images = self.frame_of_image, self.images
-        sensors = images.sensors.rotations[images.lens_of]
-        of_frames = relative_rotations_of_frames(relative, of_image, sensors)
-        gravity = self.known.gravity
-        gravity = None if gravity is None else gravity.of_frames(of_image, sensors)
-        scores = PairScores() if images.has_rigs else self.scores
-        averaging = ComponentAveraging(self.options.averaging, self.clock, gravity, scores)
-        for frames, averaged in averaging.average(int(of_image.max()) + 1, of_frames, reasons):
-            members = np.flatnonzero(np.isin(of_image, frames))
-            places = np.searchsorted(frames, of_image[members])
-            yield frames, members, averaged.turned(places, sensors[members])
-
-    @property
-    def frame_of_image(self) -> IntArray:
-        """Frames of the images (n,), numbered as their first images stand."""
-        frame_of = self.images.frame_of
-        _, first = np.unique(frame_of, return_index=True)
-        return np.argsort(np.argsort(first))[frame_of]
-
-    @property
-    def inputs(self) -> Inputs:
-        """What models are located from."""
-        return replace(inputs_from(self.matches.file.path), left_out=self.without)
-
-    def pose(self, members: IntArray, rotations: FloatArray) -> Images:
-        """Return some images with these rotations (k, 3, 3), all frames at the origin."""
-        return self.images.part(members).turned_to(rotations)
-
-
-# What only unsound pairs, or pairs below `min_matches`, tie to the rest.
-_UNTIED = (
-    "no pair that can be believed ties it to the others: their matches are few, fit no one relative pose, or "
-    "contradict the rest"
-)
-
-
-class ComponentAveraging(NamedTuple):
-    """How the rotations of components are averaged."""
-
-    options: AveragingOptions
-    clock: Clock
-    gravity: Gravity | None
-    """Gravity in the axes of frames."""
-    scores: PairScores = PairScores()
-    """Scores of pairs of frames, as far as they are known."""
-
-    def average(
-        self, num_frames: int, relative: RelativeRotations, reasons: dict[int, str]
-    ) -> Iterator[tuple[IntArray, AveragedRotations]]:
-        """Yield the frames of each component that got rotations, ascending, and those rotations.
-
-        Why a frame belongs to none is written to `reasons`.
-        """
-        waiting, least = _group_frames(num_frames, relative.pairs), self.options.min_model_size
-        while waiting:
-            members = waiting.pop(0)
-            if len(members) < least:
-                if len(members) > 1:
-                    few = f"matched with only {_others(len(members) - 1)}; a model needs {least}"
-                    reasons |= dict.fromkeys(members.tolist(), few)
-                continue
-            inside, local = pairs_among(relative, members)
-            try:
-                with self.clock("rotation averaging"):
-                    answer = self._average_component(members, inside, local)
-            except UnsolvableError as error:
-                reasons |= dict.fromkeys(members.tolist(), str(error))
-                continue
-            kept, left = members[answer.registered], members[~answer.registered]
-            reasons |= dict.fromkeys(left.tolist(), _UNTIED)
-            if len(left) < len(members):
-                rest = inside.pairs[np.isin(inside.pairs, left).all(axis=1)]
-                waiting = [*waiting, *(group for group in _group_frames(num_frames, rest) if len(group) > 1)]
-            if len(kept) >= least:
-                yield kept, answer.subset(answer.registered)
-            else:
-                tied = f"pairs that can be believed tie it to only {_others(len(kept) - 1)}"
-                reasons |= dict.fromkeys(kept.tolist(), f"{tied}; a model needs {least}")
-
-    def _average_component(
-        self, members: IntArray, inside: RelativeRotations, local: RelativeRotations
-    ) -> AveragedRotations:
-        """Average rotations, by the arrangement of the frames that the matches speak for, and by gravity.
-
-        The pairs among them are `inside`, and `local` by their place among the members.
-        """
-
-        def average(some: RelativeRotations) -> AveragedRotations:
-            used = some.num_matches >= self.options.min_matches
-            if not used.any():
-                raise UnsolvableError(
-                    f"none of {counted(len(used), 'pair')} has {self.options.min_matches} inlier matches; "
-                    "lower min_matches"
-                )
-            return average_relative_rotations(len(members), some.subset(used), self.clock.threads)
-
-        answer = average(local)
-        evidence = evidence_of(inside, self.scores.of(inside.pairs)[:, 1])
-        if evidence.any():
-            chosen = choose_arrangement(local, evidence, answer, average)
-            repeated, rivals = int(chosen.refused.sum()), int(chosen.rival.sum())
-            answer = replace(chosen.averaged, num_repeated=repeated, num_rivals=rivals)
-        if self.gravity is None:
-            return answer
-        return refine_with_gravity(answer, local, self.gravity.of(members))
-
-
-def pairs_among(
-    relative: RelativeRotations, members: IntArray
-) -> tuple[RelativeRotations, RelativeRotations]:
-    """Return the pairs among some images or frames, ascending, and the same by their place among these."""
-    inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
-    return inside, replace(inside, pairs=np.searchsorted(members, inside.pairs))
-
-
-def _others(count: int) -> str:
-    """Count other frames, which are images where no rig is."""
-    return f"{counted(count, 'other image')} (or frame of a rig)"
-
-
-def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:
-    """Return the connected components, ascending, the largest first; single frames are components too."""
-    labels = connected_components(num_frames, pairs)
-    groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
-    return sorted(groups, key=lambda group: (-len(group), int(group[0])))
-
-
-def refine_with_gravity(
-    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
-) -> AveragedRotations:
-    """Return averaged rotations of frames refined on their pairs and gravities together."""
-    from sfm_shapefit.rotations.gravity import with_gravity  # it loads long
-
-    supports = relative.weight_shares * relative.num_matches
-    count = len(averaged.registered)
-    given = check_pairs(relative.pairs, relative.rotations, relative.information, supports, count)
-    return with_gravity(averaged, given, gravity)
-
-
-def refine_intrinsics(run: MapRun, relative: RelativeRotations) -> Images:
+def refine_intrinsics(run: MapContext, relative: RelativeRotations) -> Images:
     """Return the images with the intrinsics that first placements of all components find.
 
     Relative rotations by a wrong focal length are off by degrees, and the averaging may follow the false
     ones among them; a placement that is wrong in places knows the focal length all the same. Where a
     camera is in several components, the one with most images counts.
     """
-    found, is_found = run.images, np.zeros(len(run.images.lenses), dtype=np.bool_)
+    images, is_known = run.images, np.zeros(len(run.images.lenses), dtype=np.bool_)
     for _, members, averaging in run.average_images(relative, {}):
         inputs = _inputs_of(run, members, averaging).without_positions()
-        source = see_matches(run.matches, inputs.images, run.inputs, run.options)
+        source = see_within_limit(see_matches(run.matches, inputs.images, run.inputs), run.options)
         with suppress(UnsolvableError):
             try:
                 first = _place_first(inputs, source, run.clock)
             except ContradictedOffsetsError:  # by directions of lenses that are not known yet
                 first = _place_first(*at_one_center(inputs, source), run.clock)
             rows = run.images.lenses_of(first.images)
-            found = found.with_lenses_of(first.images, first.is_tried & ~is_found[rows])
-            is_found[rows] |= first.is_tried
-    return found
+            images = images.with_lenses_of(first.images, first.is_tried & ~is_known[rows])
+            is_known[rows] |= first.is_tried
+    return images
 
 
 def _place_first(inputs: RunInputs, source: MatchSource, clock: Clock) -> Estimate:
@@ -332,7 +65,7 @@ def _place_first(inputs: RunInputs, source: MatchSource, clock: Clock) -> Estima
 
 
 def locate_components(
-    run: MapRun, relative: RelativeRotations, visits: Sequence[Visit], reasons: dict[int, str]
+    run: MapContext, relative: RelativeRotations, visits: Sequence[Visit], reasons: dict[int, str]
 ) -> list[MappedModel]:
     """Return a model of each component that can be placed, most cameras first.
 
@@ -357,13 +90,13 @@ def locate_components(
 def _rigid_models(component: MappedModel, least: int) -> Iterator[MappedModel]:
     """Yield the model of a component, and those of its further rigid pieces with so many cameras.
 
-    The pairs between them tell no scale, but a join may, and `locate` of one cannot.
+    Pairs between two pieces tell no scale; a join of the two models may.
     """
     first = component.located
     large = [piece for piece in first.further if int(piece.kept.sum()) >= least]
     rest = tuple(piece for piece in first.further if piece not in large)
-    there = np.any([piece.placed.is_posed for piece in (first, *large)], axis=0)
-    first, *large = (replace(one, elsewhere=there & ~one.placed.is_posed) for one in (first, *large))
+    placed = np.any([piece.placed.is_posed for piece in (first, *large)], axis=0)
+    first, *large = (replace(one, elsewhere=placed & ~one.placed.is_posed) for one in (first, *large))
     yield replace(component, located=replace(first, further=rest))
     for piece in large:
         rows = np.sort(piece.placement.cameras)
@@ -372,24 +105,24 @@ def _rigid_models(component: MappedModel, least: int) -> Iterator[MappedModel]:
 
 
 def _locate_component(
-    run: MapRun, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
+    run: MapContext, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
 ) -> LocateResult:
     """Place one component: adjust a first placement, and locate from the rotations of that."""
     inputs, read = _inputs_of(run, members, averaging), run.inputs
     _, among = pairs_among(relative, members)
     if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
         read = replace(read, left_out=read.left_out | _false_pairs(inputs.images, among, averaging))
-    source = replace(see_matches(run.matches, inputs.images, read, run.options), alone=among)
-    found = make_model(inputs, source, run.clock)
+    source = see_within_limit(see_matches(run.matches, inputs.images, read), run.options)
+    source = replace(source, alone=among)
+    result = make_model(inputs, source, run.clock)
     return replace(
-        found,
-        scores=run.scores.of(members[found.directions.pairs]),
-        suspicions=(*found.suspicions, *_suspicions(averaging)),
+        result,
+        scores=run.scores.of(members[result.directions.pairs]),
+        suspicions=(*result.suspicions, *_suspicions(averaging)),
     )
 
 
-def _inputs_of(run: MapRun, members: IntArray, averaging: AveragedRotations) -> RunInputs:
-    """Return what the models of a component's images are made by."""
+def _inputs_of(run: MapContext, members: IntArray, averaging: AveragedRotations) -> RunInputs:
     images, known = run.pose(members, averaging.rotations), run.known.of(members)
     if known.priors is not None:  # without notes: the run says them once
         known = replace(known, priors=replace(known.priors, notes=()) if len(known.priors) else None)
@@ -424,8 +157,59 @@ def _suspicions(averaging: AveragedRotations) -> Iterator[Reason]:
 
 
 def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) -> Iterator[Loop]:
-    """Yield the visits that begin among some images, by name."""
     for visit in visits:
         first, second = ((names[a], names[b]) for a, b in (visit.first, visit.second))
         if first[0] in among:
             yield Loop.taken_from(visit, first=first, second=second)
+
+
+def join_mapped(
+    models: Sequence[MappedModel], run: MapContext
+) -> tuple[tuple[Joined, ...], tuple[JoinedModel, ...], tuple[str, ...]]:
+    """Join the models of a run, largest first, where that is safe and wanted.
+
+    Returns:
+        What came of joining each model but the largest, the models in one world, larger ones first, and what
+        was told and could not be used for it, a sentence each.
+    """
+    if len(models) < 2 or run.options.join == "never":
+        return (), (), ()
+    located = {number: model.located for number, model in enumerate(models)}
+    pieces = [
+        ModelPiece(
+            label=f"model {number}",
+            model=read_model(one.model.arrays()),
+            scale_sigma=(one.gauge.scale_sigma or 0.0) if one.images.has_rigs else None,
+        )
+        for number, one in located.items()
+    ]
+    warnings: list[str] = []
+    priors = list(_priors_of(pieces, run, warnings))
+    tied = tie_pieces(pieces, run.matches, run.without)
+    joins = list(judge_joins(pieces, tied, priors))
+    options, inputs = run.options, run.inputs
+    join_inputs = JoinInputs(joins, flat_values(options), inputs, options.gauge.known_distance, located)
+    joined = []
+    for group in merge_groups(pieces, tied, joins):
+        source = see_matches(run.matches, read_model(group.reconstruction).images, inputs)
+        joined.append(tell_group(group, join_inputs, source, options.directions, run.clock.anew()))
+    return tuple(joins), tuple(joined), tuple(warnings)
+
+
+def _priors_of(
+    pieces: Sequence[ModelPiece], run: MapContext, warnings: list[str]
+) -> Iterator[PositionPriors | None]:
+    """Yield the position priors of the images of each piece, told or those of the database."""
+    priors = run.known.priors
+    if priors is None:
+        try:
+            priors = database_priors(run.matches.file, run.images)
+        except MissingPriorsError:
+            pass
+        except InputError as error:
+            warnings.append(f"the position priors of the database join no models: {error}")
+    for piece in pieces:
+        piece_priors = (
+            None if priors is None else priors.of(np.searchsorted(run.images.names, piece.model.images.names))
+        )
+        yield piece_priors if piece_priors else None

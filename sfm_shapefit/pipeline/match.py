@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.record import write_json
@@ -21,7 +22,6 @@ from sfm_shapefit.files.colmap.photographs import (
 from sfm_shapefit.files.colmap.picture_matches import read_descriptors
 from sfm_shapefit.files.options import MATCHING_FILE, MOST_EXHAUSTIVE, MatchingOptions
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, alike_pairs
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.scene.sequences import find_sequences
 from sfm_shapefit.solver.options import SolverOptions
 
@@ -60,7 +60,7 @@ def match_images(
         InputError: if there are no two images that can be read, or the database is of other images.
     """
     options = merge_options(options, MatchingOptions, overrides)
-    clock = Clock.of(progress, SolverOptions(threads=threads))
+    clock = Clock.of(progress, SolverOptions(threads=threads).threads)
     folder, path = Path(images), Path(database)
     refuse_lens(options)
     if options.mask_path:

@@ -1,27 +1,26 @@
 """From matches to the problem that is solved: directions, the view graph with its points, the evidence."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
-from sfm_shapefit.facts.options import InspectOptions, PlacingOptions
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
+from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.memory import Economy, Workload, describe_work, keep_within_memory
 from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, is_among, rows_of_pairs
@@ -47,41 +46,24 @@ _ADVICE = {
 """What to do where no pair has a direction, by the most frequent reason."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Measured:
-    """What one pass over the matches yields."""
-
-    directions: PairDirections
-    """Directions of all pairs, usable or not."""
-    tracks: TrackJoiner | None = None
-    """Joins points seen by three cameras or more, which may become nodes; None where not asked for."""
-    checks: bool = False
-    """Whether those are known, and were asked for, that no single match holds together."""
-    errors: list[FloatArray] | None = None
-    """Samples of the usable directions' errors, which share keypoints, (m, NUM_SAMPLES, 2) in parts. None
-    where directions count as independent."""
-    facts_per_match: float = 1.0
-    """See `Evidence`."""
-
-
-class Wanted(NamedTuple):
-    """What a pass over the matches is to tell beside the directions."""
+class MeasureRequest(NamedTuple):
+    """What a pass over the matches yields beside the directions."""
 
     tracks: PointNodes = "never"
-    """Whether tracks are joined; by "auto" those of many cameras only where their pairs do not hold them."""
+    """Whether tracks are joined; "auto" joins those of many cameras only where pairs do not hold them."""
     checked: bool = False
     errors: bool = False
     facts: bool = False
-    """Whether `Measured.facts_per_match` is told."""
+    """Whether `MeasuredPairs.facts_per_match` is computed."""
 
 
-DIRECTIONS = Wanted()
+DIRECTIONS_ALONE = MeasureRequest()
 """Nothing beside them."""
 
 
 def measure(
-    source: MatchSource, options: DirectionOptions, clock: Clock, wanted: Wanted = DIRECTIONS
-) -> Measured:
+    source: MatchSource, options: DirectionOptions, clock: Clock, wanted: MeasureRequest = DIRECTIONS_ALONE
+) -> MeasuredPairs:
     """Measure the direction of every pair of a source, and what is wanted beside, in one pass.
 
     Pairs of two fixed images are left out.
@@ -92,14 +74,14 @@ def measure(
     Raises:
         UnsolvableError: if no pair has a match.
     """
-    beside = _Beside(source, options.inlier_threshold_px, wanted, clock.threads)
+    beside = _SideResults(source, options.inlier_threshold_px, wanted, clock.threads)
     without = source.pairs_of_fixed
     if clock.executor is not None and source.has_database:
         parts = measure_with_workers(source.view, partial(estimate_directions, options=options), clock)
         if without is not None and parts:
             every = concatenate(parts)
             parts = [every.subset(np.flatnonzero(~is_among(every.pairs, without)))]
-        if parts and wanted != DIRECTIONS:
+        if parts and wanted != DIRECTIONS_ALONE:
             for batch, directions in _again(source, concatenate(parts)):
                 beside.add(batch, directions)
     else:
@@ -114,12 +96,12 @@ def measure(
             "no two posed images share matches; match the images, or give the database that has their matches"
             f"{source.matches.lacking and f' ({source.matches.lacking})'}"
         )
-    directions, asked = concatenate(parts), beside.joiner is None and wanted.tracks == "auto"
-    if asked and not _is_held_by_pairs(view_graph(source.images, directions)):
+    directions, tracks_open = concatenate(parts), beside.joiner is None and wanted.tracks == "auto"
+    if tracks_open and not _is_held_by_pairs(view_graph(source.images, directions)):
         beside.joiner = _new_joiner(source, options.inlier_threshold_px)
-        for batch, own in _again(source, directions):
-            beside.joiner.add(batch, own)
-    return Measured(
+        for batch, batch_directions in _again(source, directions):
+            beside.joiner.add(batch, batch_directions)
+    return MeasuredPairs(
         directions=directions,
         tracks=beside.joiner,
         checks=wanted.checked and beside.joiner is not None and beside.joiner.holds_all,
@@ -138,10 +120,17 @@ def _again(source: MatchSource, directions: PairDirections) -> Iterator[tuple[Ma
         yield batch, directions.subset(rows_of_pairs(batch.pairs, directions.pairs))
 
 
-class _Beside:
-    """What is made of each batch beside its directions."""
+def are_sampled(num_usable: int, num_pairs: int) -> bool:
+    """Return whether the errors of so many usable directions, of so many pairs, are sampled."""
+    return num_usable <= _MAX_SAMPLED_PAIRS and num_pairs <= _MOST_PAIRS
 
-    def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted, threads: int) -> None:
+
+class _SideResults:
+    """Tracks, errors and counts that each batch adds to."""
+
+    def __init__(
+        self, source: MatchSource, threshold_px: float, wanted: MeasureRequest, threads: int
+    ) -> None:
         view, self._threads = source.view, threads
         self._threshold_px, self._num_usable, self._counts_pairs = threshold_px, 0, wanted.facts
         is_sampled = wanted.errors and view.num_pairs <= _MOST_PAIRS
@@ -160,8 +149,8 @@ class _Beside:
         usable = directions.usable()
         self._num_usable += len(usable)
         for row in usable.tolist() if self._counts_pairs else ():  # faster than `np.add.at`
-            own = batch.keypoints[batch.offsets[row] : batch.offsets[row + 1]]
-            self._num_pairs_of[self._begins[batch.pairs[row]] + own] += 1
+            keypoints = batch.keypoints[batch.offsets[row] : batch.offsets[row + 1]]
+            self._num_pairs_of[self._begins[batch.pairs[row]] + keypoints] += 1
         if self._num_usable > _MAX_SAMPLED_PAIRS:
             self.errors = None
         if self.errors is not None:
@@ -198,12 +187,12 @@ def view_graph(images: Images, directions: PairDirections) -> ViewGraph:
 
 def wants_points(source: MatchSource, options: NodeOptions) -> PointNodes:
     """Return whether 3D points join the view graph, "auto" where that depends on what the pairs hold."""
-    is_wanted = options.uses_points(source.images.num_images) and source.economy.points
+    is_wanted = options.uses_points(source.images.num_images) and source.memory_plan.points
     return options.points if is_wanted else "never"
 
 
 def build_graph(
-    images: Images, measured: Measured, nodes: NodeOptions, *, checked: bool = False
+    images: Images, measured: MeasuredPairs, nodes: NodeOptions, *, checked: bool = False
 ) -> MeasuredGraph:
     """Return the graph of the usable directions, with 3D points as further nodes if there are tracks.
 
@@ -228,30 +217,7 @@ def _is_held_by_pairs(graph: ViewGraph) -> bool:
     return bool(is_spread) and is_parallel_rigid(graph.num_nodes, graph.edges, graph.dimension)
 
 
-def count_work(
-    source: MatchSource, directions: PairDirections, options: PlacingOptions | InspectOptions
-) -> Workload:
-    """Return the work to do, as far as it is known once the directions are measured."""
-    usable = directions.usable()
-    is_few = len(usable) <= _MAX_SAMPLED_PAIRS and len(directions.pairs) <= _MOST_PAIRS
-    return replace(
-        source.workload(options),
-        num_pairs=len(directions.pairs),
-        num_matches=int(directions.num_matches.sum()),
-        num_sampled=len(usable) if source.economy.samples and is_few else 0,
-    )
-
-
-def keep_within_limit(
-    graph: MeasuredGraph, source: MatchSource, measured: Measured, options: PlacingOptions
-) -> tuple[Economy, MeasuredGraph]:
-    """Return what is given up to stay below the limit of memory, and the graph then."""
-    work = count_work(source, measured.directions, options)
-    describe = partial(describe_work, work=work, options=options.placement)
-    return keep_within_memory(graph, describe, options.memory.max_memory_mb, source.economy)
-
-
-def add_evidence(graph: MeasuredGraph, measured: Measured) -> MeasuredGraph:
+def add_evidence(graph: MeasuredGraph, measured: MeasuredPairs) -> MeasuredGraph:
     """Return the graph with what the matches say of its cameras.
 
     The errors of directions to points are independent draws of their own covariance. The samples of
@@ -259,10 +225,10 @@ def add_evidence(graph: MeasuredGraph, measured: Measured) -> MeasuredGraph:
     """
     assert graph.covariance is not None
     directions, usable = measured.directions, measured.directions.usable()
-    own = graph.covariance[len(usable) :]
+    ray_covariance = graph.covariance[len(usable) :]
     errors = None
     if measured.errors is not None:
-        errors = np.empty((graph.graph.num_edges, NUM_SAMPLES, own.shape[1]))
+        errors = np.empty((graph.graph.num_edges, NUM_SAMPLES, ray_covariance.shape[1]))
         filled = 0
         while measured.errors:
             part = measured.errors.pop(0)
@@ -270,7 +236,7 @@ def add_evidence(graph: MeasuredGraph, measured: Measured) -> MeasuredGraph:
             filled += len(part)
         drawn = errors[filled:]  # in place
         np.random.default_rng(0).standard_normal(out=drawn)
-        drawn *= np.sqrt(np.diagonal(own, axis1=1, axis2=2))[:, None, :]
+        drawn *= np.sqrt(np.diagonal(ray_covariance, axis1=1, axis2=2))[:, None, :]
     evidence = Evidence(
         contradicting=directions.pairs[directions.contradicting()].reshape(-1, 2),
         errors=errors,

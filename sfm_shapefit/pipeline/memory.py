@@ -6,22 +6,25 @@ analysis knows beforehand. The bytes per item below were fitted to runs on seven
 forecasts are 1.02 to 1.2 times the peaks, with a limit of 1,500 MB at 10,000 images, too.
 
 The limit is looked at twice before anything is solved: with the counts of the database, and once the graph is
-known. What can be given up is listed in `ECONOMIES`, the cheapest first; the first that fits is taken.
+known. What can be given up is listed in `MEMORY_PLANS`, the cheapest first; the first that fits is taken.
 """
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.inspected import Forecast
+from sfm_shapefit.facts.options import InspectOptions, PlacingOptions
 from sfm_shapefit.files.colmap.database import MOST_KEYPOINTS, PIXEL_BYTES
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.measure import are_sampled
+from sfm_shapefit.placement.memory_plan import MEMORY_PLANS, MemoryPlan
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.scene.matches import KEPT_MATCHES, MOST_BESIDE_TRACKS, PLENTY, Reading
-from sfm_shapefit.solver.options import NO_FACTOR
+from sfm_shapefit.scene.matches import KEPT_MATCHES, MOST_BESIDE_TRACKS
 from sfm_shapefit.solver.solve import choose_method, plan_factor
 
 _MB = 1e6  # bytes; as users count them
@@ -34,8 +37,6 @@ _BLOCK = 9  # entries of a block of the factor; three coordinates by three
 _OBSERVATIONS_OF_A_MATCH = 0.7  # observations for a match, if keypoints are more; .45 to .66 measured
 _OBSERVATION_BYTES = 420.0  # bytes of an observation; its track, and its part of the normal equations
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000  # unknowns of an adjusted camera; up to as many, their system is dense
-
-_FRUGAL = Reading(batch=50_000, rays_bytes=50_000_000, keeps=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,70 +66,25 @@ class Workload:
     """Whether the factor cannot be given up, since the solve itself works with it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Economy:
-    """What is given up for memory."""
-
-    statement: str = ""
-    """What that is, for the user; empty for nothing."""
-    reading: Reading = PLENTY
-    """How matches are read."""
-    samples: bool = True
-    """Whether the errors of directions are sampled together where keypoints are shared."""
-    points: bool = True
-    """Whether 3D points may join the graph."""
-    adjustment: bool = True
-    """Whether placed cameras may be adjusted by their matches."""
-    factor: bool = True
-    """Whether there is a factor for the refinement and the standard deviations."""
-
-    def limit(self, options: PlacementOptions) -> PlacementOptions:
-        """Return how to place: as asked, or, if the factor is given up, unrefined and without one."""
-        if self.factor:
-            return options
-        return replace(options, solver=replace(options.solver, factor_memory_mb=NO_FACTOR), refine=False)
-
-
-def _list_economies() -> Iterator[Economy]:
-    """Yield what can be given up, the cheapest first, each with all that comes before it."""
-    economy = Economy()
-    yield economy
-    given_up: list[str] = []
-    for what, changes in (
-        ("matches are read in small batches", {"reading": _FRUGAL}),
-        ("directions count as independent in standard deviations", {"samples": False}),
-        ("no 3D points join the view graph", {"points": False}),
-        ("cameras are not adjusted by their matches", {"adjustment": False}),
-        ("locations are neither refined nor have they standard deviations", {"factor": False}),
-    ):
-        given_up.append(what)
-        economy = replace(economy, statement=", ".join(given_up), **changes)
-        yield economy
-
-
-ECONOMIES = tuple(_list_economies())
-"""The cheapest first."""
-
-
-def forecast(work: Workload, economy: Economy = ECONOMIES[0]) -> Forecast:
+def forecast(work: Workload, plan: MemoryPlan = MEMORY_PLANS[0]) -> Forecast:
     """Return what a run will take, if so much is given up for memory."""
-    memory_mb = {stage: size / _MB for stage, size in _peaks(work, economy).items()}
+    memory_mb = {stage: size / _MB for stage, size in _peaks(work, plan).items()}
     return Forecast(memory_mb=memory_mb, peak_mb=max(memory_mb.values()))
 
 
-def choose_economy(
-    work: Workload, without_points: Workload, limit_mb: float, least: Economy = ECONOMIES[0]
-) -> Economy:
-    """Return the cheapest economy, from `least` on, whose forecast stays below a limit.
+def choose_memory_plan(
+    work: Workload, without_points: Workload, limit_mb: float, least: MemoryPlan = MEMORY_PLANS[0]
+) -> MemoryPlan:
+    """Return the cheapest plan, from `least` on, whose forecast stays below a limit.
 
     Raises:
         InputError: if none does; the message has the number needed.
     """
     needed = np.inf
-    for economy in ECONOMIES[ECONOMIES.index(least) :]:
-        needed = forecast(work if economy.points else without_points, economy).peak_mb
+    for plan in MEMORY_PLANS[MEMORY_PLANS.index(least) :]:
+        needed = forecast(work if plan.points else without_points, plan).peak_mb
         if needed <= limit_mb:
-            return economy
+            return plan
     raise InputError(
         f"this takes about {needed:.0f} MB even with every economy, more than max_memory_mb={limit_mb:.0f}; "
         f"raise it to {np.ceil(needed / 10.0) * 10.0:.0f} or more, or split the model"
@@ -136,17 +92,18 @@ def choose_economy(
 
 
 def keep_within_memory(
-    measured: MeasuredGraph, describe: Callable[[MeasuredGraph], Workload], limit_mb: int, least: Economy
-) -> tuple[Economy, MeasuredGraph]:
-    """Return what is given up, `least` or more, to stay below a limit that is not 0, and the graph then.
+    measured: MeasuredGraph, work: Workload, options: PlacingOptions, least: MemoryPlan
+) -> tuple[MemoryPlan, MeasuredGraph]:
+    """Return what is given up, `least` or more, to stay below the limit of memory, and the graph then.
 
-    `describe` returns the work that a graph makes.
+    `work` is all of it but for the graph.
     """
-    if not limit_mb:
+    if not options.memory.max_memory_mb:
         return least, measured
     bare = measured.without_points()
-    economy = choose_economy(describe(measured), describe(bare), limit_mb, least)
-    return economy, measured if economy.points else bare
+    full, less = (describe_work(graph, work, options.placement) for graph in (measured, bare))
+    plan = choose_memory_plan(full, less, options.memory.max_memory_mb, least)
+    return plan, measured if plan.points else bare
 
 
 def describe_work(measured: MeasuredGraph, work: Workload, options: PlacementOptions) -> Workload:
@@ -173,13 +130,12 @@ def describe_work(measured: MeasuredGraph, work: Workload, options: PlacementOpt
     )
 
 
-def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
-    """Return the bytes that are held at the peak of each stage."""
-    batch = 225.0 * min(economy.reading.batch, work.num_matches)
+def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
+    batch = 225.0 * min(plan.reading.batch, work.num_matches)
     model = 30e6 + (_COLOR_BYTES if work.num_matches else _MODEL_BYTES) * work.num_keypoints
-    rays = min(24.0 * work.num_keypoints, economy.reading.rays_bytes)
+    rays = min(24.0 * work.num_keypoints, plan.reading.rays_bytes)
     results = 350.0 * work.num_pairs + 3000.0 * work.num_images
-    is_sorted = economy.reading.keeps and work.num_matches <= MOST_MATCHES
+    is_sorted = plan.reading.keeps and work.num_matches <= MOST_MATCHES
     in_memory = MATCH_BYTES * work.num_matches if is_sorted else 0.0
     if work.num_keypoints <= MOST_KEYPOINTS:
         in_memory += PIXEL_BYTES * work.num_keypoints
@@ -188,22 +144,22 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
         "reading": _STARTED_BYTES + 30e6 + _READ_BYTES * work.num_keypoints,
         "measuring directions": throughout + batch,
     }
-    if work.has_points and economy.points:
+    if work.has_points and plan.points:
         peaks["building tracks"] = throughout + batch + 125.0 * work.num_keypoints
-    samples = 16.0 * _SAMPLES * (work.num_sampled if economy.samples else 0)
+    samples = 16.0 * _SAMPLES * (work.num_sampled if plan.samples else 0)
     solving = 900.0 * work.num_edges + 3000.0 * work.num_nodes
-    has_factor = economy.factor or work.needs_factor
+    has_factor = plan.factor or work.needs_factor
     copies = 2.2 if work.needs_factor else 1.2
     factor = copies * 8.0 * _BLOCK * work.factor_entries if has_factor else 0.0
     moved = 8.0 * 3 * _SAMPLES * 3.0 * work.num_nodes if samples else 0.0
-    is_kept = economy.reading.keeps and work.num_matches <= KEPT_MATCHES
+    is_kept = plan.reading.keeps and work.num_matches <= KEPT_MATCHES
     kept = 80.0 * work.num_matches if is_kept else 0.0
     peaks["placing"] = throughout + kept + solving + samples + moved + factor + 0.5 * batch
     tracks = 44.0 * work.num_keypoints + MATCH_BYTES * work.num_matches + 0.5 * batch  # and the seed
     if work.num_matches > MOST_BESIDE_TRACKS:
         tracks -= in_memory
     seeded = throughout + kept + 300.0 * work.num_edges + tracks
-    if work.adjusts_bundle or (work.adjusts and economy.adjustment):
+    if work.adjusts_bundle or (work.adjusts and plan.adjustment):
         observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches)
         adjusting = _OBSERVATION_BYTES * observations + _adjusted_cameras_bytes(work)
         peaks["adjusting"] = seeded + adjusting
@@ -221,3 +177,40 @@ def _adjusted_cameras_bytes(work: Workload) -> float:
     blocks = 3.0 * 8.0 * _UNKNOWNS**2 * (work.num_pairs + work.num_images)
     entries = unknowns**2 if unknowns <= _DENSE_UNKNOWNS else 1.2 * _UNKNOWNS**2 * work.factor_entries
     return blocks + 8.0 * entries
+
+
+def _read_work(source: MatchSource, options: PlacingOptions | InspectOptions) -> Workload:
+    """Return what is known of the work before any direction is measured."""
+    view, num_images = source.view, source.images.num_images
+    return Workload(
+        num_images=num_images,
+        num_keypoints=source.matches.total_keypoints,
+        num_pairs=view.num_pairs,
+        num_matches=view.num_matches,
+        num_edges=view.num_pairs,
+        num_nodes=num_images,
+        adjusts=options.placement.refines and options.freedom.adjusts_cameras(num_images),
+        adjusts_bundle=options.freedom.adjust == "full",
+    )
+
+
+def see_within_limit(source: MatchSource, options: PlacingOptions) -> MatchSource:
+    """Return the matches of a database with what is given up, by their counts, for the limit of memory."""
+    if not options.memory.max_memory_mb or not source.has_database:
+        return source
+    bare, images = _read_work(source, options), source.images
+    work = replace(bare, has_points=options.nodes.uses_points(images.num_images))
+    return source.at(images, choose_memory_plan(work, bare, options.memory.max_memory_mb))
+
+
+def count_work(
+    source: MatchSource, directions: PairDirections, options: PlacingOptions | InspectOptions
+) -> Workload:
+    """Return the work to do, as far as it is known once the directions are measured."""
+    num_usable, num_pairs = len(directions.usable()), len(directions.pairs)
+    return replace(
+        _read_work(source, options),
+        num_pairs=num_pairs,
+        num_matches=int(directions.num_matches.sum()),
+        num_sampled=num_usable if source.memory_plan.samples and are_sampled(num_usable, num_pairs) else 0,
+    )

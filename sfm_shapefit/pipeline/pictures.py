@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.sources import collect_matches
 from sfm_shapefit.adjustment.structure import triangulate
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.wording import counted
@@ -26,41 +26,36 @@ from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, Shared, choose_pairs
 from sfm_shapefit.judgement.evidence import PairFits
-from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.evidence import Structure
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.matches import is_among
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.options import StructureOptions
 
 _FOR_FEATURES = 0.6  # share of the minutes; features take half of the time where there is no limit
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskedPictures:
-    """Pictures of a model, and the minutes that asking them may take."""
-
-    folder: Path
-    max_minutes: float | None = None
-
-
 @contextmanager
-def match_pictures(model: ColmapModel, asked: AskedPictures, clock: Clock) -> Iterator[Inputs]:
-    """Yield the inputs that a model's pictures make: a database, which is gone afterwards.
+def match_pictures(
+    model: ColmapModel, folder: Path, max_minutes: float | None, clock: Clock
+) -> Iterator[Inputs]:
+    """Yield the inputs that a model's pictures in a folder make: a database, which is gone afterwards.
 
     Raises:
         InputError: if fewer than two pictures can be read.
     """
-    refuse_no_folder(asked.folder)
-    began, minutes = time.monotonic(), np.inf if asked.max_minutes is None else asked.max_minutes
+    refuse_no_folder(folder)
+    began, minutes = time.monotonic(), np.inf if max_minutes is None else max_minutes
     with TemporaryDirectory(prefix="shapefit-") as scratch:
         path = Path(scratch) / "database.db"
         pictures = PictureMatches(model=model, database=path, threads=clock.threads)
         with clock("features"):
             states = pictures.detect(
-                asked.folder, lambda: time.monotonic() > began + 60.0 * _FOR_FEATURES * minutes, clock.advance
+                folder,
+                lambda: time.monotonic() > began + 60.0 * _FOR_FEATURES * minutes,
+                clock.advance,
             )
-        _refuse_no_pictures(asked.folder, model.images.names, states)
+        _refuse_no_pictures(folder, model.images.names, states)
         tracks = TrackMatches(model)
         shared = Shared(tracks.pairs, tracks.num_matches)
         chosen = choose_pairs(
@@ -71,10 +66,10 @@ def match_pictures(model: ColmapModel, asked: AskedPictures, clock: Clock) -> It
                 chosen.pairs, lambda: time.monotonic() > began + 60.0 * minutes, clock.advance
             )
         pictures.name_images()
-        statement = _state(asked.folder, states, chosen.reasons, count)
+        statement = _state(folder, states, chosen.reasons, count)
         rows, names = chosen.pairs[~chosen.is_near].tolist(), model.images.names
         far = frozenset((min(names[i], names[j]), max(names[i], names[j])) for i, j in rows)
-        yield Inputs(folder=None, database=path, statement=statement, images=asked.folder, far=far)
+        yield Inputs(folder=None, database=path, statement=statement, images=folder, far=far)
 
 
 def _refuse_no_pictures(folder: Path, names: Sequence[str], states: Sequence[str]) -> None:
@@ -91,10 +86,10 @@ def _state(folder: Path, states: Sequence[str], reasons: Sequence[str], count: i
     """Say what was asked, why, and what was not."""
     others = _whys(states)
     without = f" ({others})" if others else ""
-    asked = counted(count, "pair") if count == len(reasons) else f"{count:,} of {len(reasons):,} chosen pairs"
+    pairs = counted(count, "pair") if count == len(reasons) else f"{count:,} of {len(reasons):,} chosen pairs"
     num_asked = states.count("asked")
     pictures = f"{num_asked:,} of {counted(len(states), 'picture')}{without} in {folder}"
-    return f"{pictures}, {asked}: {_whys(reasons[:count])}"
+    return f"{pictures}, {pairs}: {_whys(reasons[:count])}"
 
 
 def _whys(whys: Sequence[str]) -> str:

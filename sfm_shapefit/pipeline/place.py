@@ -4,35 +4,29 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import numpy.typing as npt
 
-import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.result import GraphResult
-from sfm_shapefit.files.colmap.other_programs import relative_poses_of
-from sfm_shapefit.files.g2o import is_g2o, read_g2o, read_g2o_rotations
-from sfm_shapefit.files.glomap_text import is_relative_poses, read_relative_poses
 from sfm_shapefit.files.graph_text import read_graph
-from sfm_shapefit.files.onedsfm import EpipolarGeometries, is_onedsfm, read_onedsfm, read_rotations
-from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.measured import MeasuredGraph, direction_covariances
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import judge
-from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.pose_graphs import (
+    MAX_ROTATION_ERROR_DEG,
+    orient_pose_graph,
+    read_pose_graph,
+    without_contradicted,
+)
 from sfm_shapefit.placement.place import place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.refinement.posterior import weigh_by_triangles
-from sfm_shapefit.rotations.average import average_rotations
-from sfm_shapefit.solver.options import OnIteration
+from sfm_shapefit.solver.options import OnIteration, reported
 
 if TYPE_CHECKING:
     import pycolmap
-
-MAX_ROTATION_ERROR_DEG = 10.0  # degrees; pairs off by more are taken for false, as 1DSfM does
 
 
 def place(
@@ -78,70 +72,17 @@ def place(
     options = merge_options(options, PlacementOptions, overrides)
     threads = options.solver.num_threads()
     if isinstance(measured, Path | str):
-        poses = _relative_poses(measured)
-        measured = read_graph(measured) if poses is None else _orient(poses, None, threads=threads)[0]
+        poses = read_pose_graph(measured)
+        measured = orient_pose_graph(poses, threads=threads)[0] if poses else read_graph(measured)
     graph = MeasuredGraph(measured) if isinstance(measured, ViewGraph) else measured
     if sigma is not None:
-        graph = replace(graph, covariance=_covariances(graph.graph, sigma))
+        graph = replace(graph, covariance=direction_covariances(graph.graph, sigma))
     if rotations is not None:
-        graph = _without_contradicted(graph, rotations, num_matches, threads)
+        graph = without_contradicted(graph, rotations, num_matches, threads)
     elif num_matches is not None:
         raise InputError("num_matches say how much relative rotations count; give rotations, too")
     placed = next(place_pieces(graph, options, on_iteration=on_iteration))
     return PlacedGraph.of(judge(placed, options), options)
-
-
-def _without_contradicted(
-    measured: MeasuredGraph, rotations: npt.ArrayLike, num_matches: npt.ArrayLike | None, threads: int
-) -> MeasuredGraph:
-    """Return what was measured of the pairs whose relative rotations agree with the averaged ones."""
-    graph = measured.graph
-    averaged = average_rotations(
-        graph.edges, rotations, num_images=graph.num_nodes, weights=num_matches, threads=threads
-    )
-    relative = np.asarray(rotations, dtype=np.float64)
-    agree = _agree(graph.edges, relative, averaged.rotations, MAX_ROTATION_ERROR_DEG)
-    leave = averaged.registered[graph.edges].all(axis=1) & ~agree
-    if num_matches is None and leave.any() and np.mean(weigh_by_triangles(graph).log_odds[leave] > 0.0) > 0.5:
-        return measured
-    return measured.subset(np.flatnonzero(~leave))
-
-
-def _agree(pairs: IntArray, relative: FloatArray, rotations: FloatArray, most_deg: float) -> BoolArray:
-    """Return which relative rotations of pairs (m, 2) agree with those of the cameras (n, 3, 3), (m,)."""
-    i, j = pairs.T
-    agree = rotation_angles_deg(relative @ rotations[i] @ rotations[j].swapaxes(1, 2)) <= most_deg
-    if not agree.any():
-        raise InputError(
-            f"none of the {len(pairs)} relative rotations agrees with those of the cameras; "
-            "check that they belong together"
-        )
-    return np.asarray(agree)
-
-
-def _covariances(graph: ViewGraph, sigma: npt.ArrayLike) -> FloatArray:
-    """Return the covariances (m, d - 1, d - 1) of directions from these, or from standard deviations (m,)."""
-    given = real_numbers("sigma must be numbers, NaN where they are unknown", sigma)
-    m, k = graph.num_edges, graph.dimension - 1
-    if given.shape not in ((m,), (m, k, k)):
-        raise InputError(
-            f"sigma has shape {given.shape}; give one standard deviation, radians, for each of the {m} "
-            f"directions, or covariances of shape {(m, k, k)}"
-        )
-    known = np.nan_to_num(given, posinf=np.inf, neginf=-np.inf)
-    if given.ndim > 1 and not np.allclose(known, known.swapaxes(1, 2)):
-        raise InputError("sigma has covariances that are not symmetric; give symmetric ones")
-    if np.any(known > (np.pi if given.ndim == 1 else np.pi**2)) and not np.isinf(known).any():
-        raise InputError(
-            "sigma has values beyond pi radians, the largest angle; give radians, and NaN where they are "
-            "unknown"
-        )
-    if np.isinf(known).any() or np.any((known if given.ndim == 1 else np.linalg.eigvalsh(known)) < 0.0):
-        raise InputError(
-            "sigma has negative or infinite values; give standard deviations or covariances, and NaN where "
-            "they are unknown"
-        )
-    return np.asarray(np.square(given)[:, None, None] * np.eye(k) if given.ndim == 1 else given)
 
 
 def place_graph_file(
@@ -174,15 +115,17 @@ def place_graph_file(
         UnsolvableError: if the directions determine nothing.
     """
     options = merge_options(options, PlacementOptions, overrides)
-    clock = Clock.of(progress, options.solver)
+    clock = Clock.of(progress, options.solver.threads)
     statement = "directions as given"
     with clock("read"):
-        geometries = _relative_poses(path)
+        geometries = read_pose_graph(path)
     if geometries is not None:
         if reverse:
             raise InputError(f"{path} holds relative poses, whose sense is known; leave out reverse=True")
         with clock("rotations"):
-            graph, statement = _orient(geometries, rotations, max_rotation_error_deg, threads=clock.threads)
+            graph, statement = orient_pose_graph(
+                geometries, rotations, max_rotation_error_deg, threads=clock.threads
+            )
     else:
         assert isinstance(path, Path | str)
         if rotations is not None:
@@ -193,7 +136,7 @@ def place_graph_file(
             bare = ViewGraph(bare.num_nodes, bare.edges, -bare.directions, bare.weights, bare.names)
         graph = MeasuredGraph(bare)
     with clock("solve"):
-        placed = list(place_pieces(graph, options, on_iteration=clock.iteration))
+        placed = list(place_pieces(graph, options, on_iteration=reported(clock.advance)))
     with clock("trust"):
         judged = [judge(piece, options) for piece in placed]
     return GraphResult(
@@ -204,48 +147,3 @@ def place_graph_file(
         further=tuple(judged[1:]),
         timings_s=clock.seconds,
     )
-
-
-def _relative_poses(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeometries | None:
-    """Return the relative poses of a source; None if it is a bare graph of directions."""
-    if not isinstance(source, Path | str):
-        return relative_poses_of(source)
-    if is_onedsfm(source):
-        return read_onedsfm(source)
-    if is_g2o(source):
-        return read_g2o(source)
-    return read_relative_poses(source) if is_relative_poses(source) else None
-
-
-def _orient(
-    poses: EpipolarGeometries,
-    path: Path | str | None,
-    max_rotation_error_deg: float = MAX_ROTATION_ERROR_DEG,
-    *,
-    threads: int,
-) -> tuple[MeasuredGraph, str]:
-    """Return the directions of the pairs that agree with the rotations, of a file or averaged."""
-    if path is not None:
-        read = read_g2o_rotations if is_g2o(path) else read_rotations
-        (rotations, known), origin = read(path, poses.names), f"of {path}"
-    else:
-        averaged = average_rotations(
-            poses.pairs,
-            poses.rotations,
-            poses.information,
-            num_images=len(poses.names),
-            weights=poses.num_matches,
-            threads=threads,
-        )
-        rotations, known, origin = averaged.rotations, averaged.registered, "averaged"
-        if averaged.counts_mislead:
-            origin += " without numbers of matches, with which fewer pairs agree"
-        elif poses.num_matches is not None:
-            origin += " by the numbers of matches"
-    agreeing = np.flatnonzero(_agree(poses.pairs, poses.rotations, rotations, max_rotation_error_deg))
-    total, kept = len(poses.pairs), len(agreeing)
-    statement = (
-        f"{int(np.sum(known))} of {len(known)} rotations {origin}; {total - kept} of {total} pairs "
-        f"contradict them by more than {max_rotation_error_deg:g} deg and are left out"
-    )
-    return poses.subset(agreeing.tolist()).measured(rotations, known), statement

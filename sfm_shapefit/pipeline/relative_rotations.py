@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, rank_within
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
@@ -23,7 +24,6 @@ from sfm_shapefit.pairs.essential import (
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import LEAST_MATCHES, DirectionOptions
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.scene.matches import RayMatches, View
@@ -76,12 +76,12 @@ def relative_rotations(
     """
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
-    clock = Clock.of(progress, SolverOptions(threads=threads), executor)
+    clock = Clock.of(progress, SolverOptions(threads=threads).threads, executor)
     with clock("relative rotations"), closing(DatabaseFile(database)) as file:
         images = read_images(file).images
         view = DatabaseMatches(file, images.names).at(images.apart())
-        found = measure_rotations(view, min_matches, clock)
-    columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
+        measured = measure_rotations(view, min_matches, clock)
+    columns = {field.name: getattr(measured, field.name) for field in fields(RelativeRotations)}
     return DatabaseRotations(**columns, names=images.names)
 
 
@@ -126,8 +126,8 @@ def estimate_near(
     """
     i, j = batch.pairs.T
     turns = np.nan_to_num(rotations[j] @ rotations[i].transpose(0, 2, 1))
-    rays_i, own = np.empty_like(batch.rays_i), itertools.pairwise(batch.offsets.tolist())
-    for (first, last), turn in zip(own, turns.transpose(0, 2, 1), strict=True):
+    rays_i, bounds = np.empty_like(batch.rays_i), itertools.pairwise(batch.offsets.tolist())
+    for (first, last), turn in zip(bounds, turns.transpose(0, 2, 1), strict=True):
         np.matmul(batch.rays_i[first:last], turn, out=rays_i[first:last])
     in_axes_of_j = replace(batch, rays_i=rays_i)
     baselines = estimate_directions(in_axes_of_j, _NEAR, threads).directions
@@ -155,14 +155,14 @@ def estimate_here(
 
     `estimate` is called with a batch, the number of threads, and whom to tell of pairs that are done.
     """
-    parts, before, total = [], 0, view.num_pairs
+    parts, num_before, total = [], 0, view.num_pairs
     for batch in view.batches(min_matches, without, threads=clock.threads):
 
-        def advance(done: int, before: int = before) -> None:
-            clock.advance(before + done, total)
+        def advance(done: int, num_before: int = num_before) -> None:
+            clock.advance(num_before + done, total)
 
         parts.append(estimate(batch, clock.threads, advance))
-        before += len(batch.pairs)
+        num_before += len(batch.pairs)
     if without is None:
         clock.advance(total, total)
     return concatenate_rotations(parts)

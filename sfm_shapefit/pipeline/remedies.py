@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.judgement.wrong_lenses import is_like_others
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.conventions import ask_resolution
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
-from sfm_shapefit.pipeline.rigs import measure_hold
+from sfm_shapefit.pipeline.placing import measure_hold
 from sfm_shapefit.pipeline.stages import run_stages
 from sfm_shapefit.pipeline.starts import begin_model
 from sfm_shapefit.placement.gauge import UselessPriorsError
@@ -39,27 +39,27 @@ class Remedy(NamedTuple):
     moved: tuple[str, ...]
     """Names of cameras whose pairs for this place are left out, as twice as many agree on another."""
 
-    def cures(self, after: LocateResult, before: LocateResult) -> bool:
+    def is_better(self, after: LocateResult, before: LocateResult) -> bool:
         """Return whether less speaks against a result than before, with lenses known and no camera lost."""
         less, images = _count(after) < _count(before), after.images
         open_ = after.intrinsics.undetermined[list(self.freed)].any()
         alike = all(is_like_others(images, k, images.lenses[k].focal_px, s) for k, s in self.freed.items())
         return bool(less and alike and not open_ and after.kept.sum() >= before.kept.sum())
 
-    def applied(self, found: LocateResult) -> LocateResult:
+    def applied(self, result: LocateResult) -> LocateResult:
         """Return a result of this remedy, which says so; a freed lens is as uncertain as its images are."""
-        sigmas = found.intrinsics.focal_sigmas.copy()
+        sigmas = result.intrinsics.focal_sigmas.copy()
         for row, sigma in self.freed.items():
             sigmas[row] = np.maximum(sigmas[row], sigma)
-        found = replace(found, intrinsics=replace(found.intrinsics, focal_sigmas=sigmas))
-        ids = {found.placed.lenses[row].id for row in self.freed}
-        lenses = (row.statement for row in found.intrinsics.rows(found.placed) if row.camera in ids)
+        result = replace(result, intrinsics=replace(result.intrinsics, focal_sigmas=sigmas))
+        ids = {result.placed.lenses[row].id for row in self.freed}
+        lenses = (row.statement for row in result.intrinsics.rows(result.placed) if row.camera in ids)
         done = [
             f"{lens}: its images contradicted what was given, unless --intrinsics held" for lens in lenses
         ]
         if self.moved:
             done.append(f"{', '.join(self.moved)}: placed without the pairs that twice as many contradict")
-        return replace(found, warnings=(*done, *found.warnings))
+        return replace(result, warnings=(*done, *result.warnings))
 
 
 def make_model(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateResult:
@@ -68,16 +68,16 @@ def make_model(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateRe
     Raises:
         UnsolvableError: if no camera can be placed.
     """
-    found, told = _run_in_scale(inputs, source, clock), tuple[str, ...]()
-    if isinstance(found, str):
+    result, notes = _run_in_scale(inputs, source, clock), tuple[str, ...]()
+    if isinstance(result, str):
         inputs, source = at_one_center(inputs, source)
-        told, found = (found,), _run(inputs, source, clock)
-    for remedy in find_remedies(found, inputs, source):
+        notes, result = (result,), _run(inputs, source, clock)
+    for remedy in find_remedies(result, inputs, source):
         again = _run(remedy.inputs, remedy.source, clock)
-        if remedy.cures(again, found):
-            found = remedy.applied(again)
+        if remedy.is_better(again, result):
+            result = remedy.applied(again)
             break
-    return replace(found, warnings=(*told, *found.warnings))
+    return replace(result, warnings=(*notes, *result.warnings))
 
 
 def _run(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateResult:
@@ -101,8 +101,8 @@ def _run_in_scale(inputs: RunInputs, source: MatchSource, clock: Clock) -> Locat
     """
     longest = float(np.linalg.norm(inputs.images.sensors.translations, axis=1).max(initial=0.0))
     try:
-        found = _run(inputs, source, clock)
-        sigma = found.placement.scale_sigma
+        result = _run(inputs, source, clock)
+        sigma = result.placement.scale_sigma
     except ContradictedOffsetsError as error:
         sigma = measure_hold(error.placement).scale_sigma
         is_short = error.length > -_SHORT or sigma > _OPEN_SCALE
@@ -114,7 +114,7 @@ def _run_in_scale(inputs: RunInputs, source: MatchSource, clock: Clock) -> Locat
             f"the offsets of sensors in their rigs, at most {longest:.2g}, are too short for this scene to "
             "tell its scale, so the sensors of a rig are taken to share one center"
         )
-    return found
+    return result
 
 
 def at_one_center(inputs: RunInputs, source: MatchSource) -> tuple[RunInputs, MatchSource]:
@@ -125,20 +125,20 @@ def at_one_center(inputs: RunInputs, source: MatchSource) -> tuple[RunInputs, Ma
     return replace(inputs, images=inputs.images.with_sensors(*at_one)), source.at(images)
 
 
-def find_remedies(found: LocateResult, inputs: RunInputs, source: MatchSource) -> Iterator[Remedy]:
+def find_remedies(result: LocateResult, inputs: RunInputs, source: MatchSource) -> Iterator[Remedy]:
     """Yield what to start from instead, where something can be done about what speaks against a result."""
     images, intrinsics, options = source.images, inputs.intrinsics, inputs.options
     may_free = options.freedom.intrinsics != "held" and options.freedom.adjusts_cameras(images.num_images)
     freed = {
         wrong.lens: wrong
-        for wrong in found.evidence.lenses
+        for wrong in result.evidence.lenses
         if may_free and images.lenses[wrong.lens].is_adjustable and not intrinsics.parts[wrong.lens, FOCAL]
     }
     if freed and ask_resolution(source) is not None:
         freed = {}  # pixels of another resolution ask for another focal length, and are no fault of the lens
     # A camera that is fixed, or held by its rig, cannot go where its pairs are.
     may_move = not (images.has_rigs or inputs.fixed.any())
-    places = found.evidence.places if may_move else ()
+    places = result.evidence.places if may_move else ()
     moved = [place for place in places if place.num_there >= OUTNUMBERED * place.num_here]
     if not (freed or moved):
         return
@@ -153,7 +153,7 @@ def find_remedies(found: LocateResult, inputs: RunInputs, source: MatchSource) -
     names = ((images.names[i], images.names[j]) for i, j in pairs.tolist())
     left_out = source.inputs.left_out | {(min(pair), max(pair)) for pair in names}
     read = replace(source.inputs, left_out=left_out)
-    view = source.matches.at(images.with_lenses(lenses), left_out, source.economy.reading)
+    view = source.matches.at(images.with_lenses(lenses), left_out, source.memory_plan.reading)
     yield Remedy(
         replace(inputs, intrinsics=replace(intrinsics, parts=parts)),
         replace(source, inputs=read, view=view),
@@ -162,9 +162,9 @@ def find_remedies(found: LocateResult, inputs: RunInputs, source: MatchSource) -
     )
 
 
-def _count(found: LocateResult) -> int:
+def _count(result: LocateResult) -> int:
     """Return the number of lenses and cameras that evidence names, and of cameras that are left out."""
-    evidence, left_out = found.evidence, int(np.sum(~found.kept))
+    evidence, left_out = result.evidence, int(np.sum(~result.kept))
     apart = sum(len(seam.cameras) for seam in evidence.seams)
     apart += sum(len(group.cameras) for group in evidence.untied)
     return len(evidence.lenses) + left_out + len(evidence.places) + apart

@@ -12,6 +12,7 @@ from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import BoolArray, hand_back_memory
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.support import (
@@ -21,7 +22,6 @@ from sfm_shapefit.judgement.support import (
     images_of_few_points,
     images_without_support,
 )
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
@@ -37,18 +37,18 @@ def select_trusted(placement: Judged, min_trust: float) -> BoolArray:
     return kept if np.sum(kept) >= _FEWEST_KEPT else np.ones_like(kept)
 
 
-def seed_points(state: ModelState, clock: Clock, sure: BoolArray | None = None) -> ModelState:
+def seed_points(state: ModelState, clock: Clock, confirmed: BoolArray | None = None) -> ModelState:
     """Move the kept cameras, triangulate points, and adjust both if asked for.
 
     Bundle adjustment is free to scale, shift and turn everything; the gauge is set after it. Half of the
-    points suffice for images (i,) that are `sure`, as the pixels confirm them.
+    points suffice for images (i,) that are `confirmed` by the pixels.
     """
     source, options, fixed = state.source, state.inputs.options, state.inputs.fixed_frames
     images, points, bundle, partners = _make_points(state, clock)
     hand_back_memory()  # the links are gone
     least = np.full(len(fixed), options.structure.min_points_per_image)
-    if sure is not None:
-        least[images.frame_of[sure]] = (least[images.frame_of[sure]] + 1) // 2
+    if confirmed is not None:
+        least[images.frame_of[confirmed]] = (least[images.frame_of[confirmed]] + 1) // 2
     seen = images_of_few_points(points, images, least, fixed)
     images, points = _leave_out(seen >= 0, images, points)
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)
@@ -94,7 +94,6 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
 
 
 def _count(links: Links, images: Images, partners: PartnerCounts) -> PartnerCounts:
-    """Count matches between all posed ones of some images."""
     if isinstance(links, MatchedKeypoints):
         rows = images.posed_rows
         posed = images.part(rows)

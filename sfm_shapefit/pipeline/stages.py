@@ -10,8 +10,8 @@
     examine_model        evidence that the fit did not use
     finish_model         `finish`: the result
 
-Each rigid piece goes through all stages after `place_rigid_pieces`. A further piece has a unit of its own:
-nothing that is known of positions says how large it is, and where.
+Each rigid piece goes through all stages after `place_rigid_pieces`. A further piece has an arbitrary
+scale: nothing that is known of positions says how large it is, and where it stands.
 """
 
 from dataclasses import replace
@@ -19,29 +19,25 @@ from functools import partial
 
 import numpy as np
 
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.doubted import confirm_cameras
 from sfm_shapefit.judgement.judged import Judged, judge
-from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_cameras, with_uncertainty
-from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
+from sfm_shapefit.pipeline.camera_adjustment import adjust_placed, pull_cameras, with_uncertainty
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
-from sfm_shapefit.pipeline.evidence import confirm_by_pixels, open_beyond_noise, question, shape_of
+from sfm_shapefit.pipeline.examination import confirm_by_pixels, open_beyond_noise, question, shape_of
 from sfm_shapefit.pipeline.finish import finish_model
-from sfm_shapefit.pipeline.gauge_choice import bring_to_gauge, bring_to_known, choose_frame
-from sfm_shapefit.pipeline.measure import (
-    Measured,
-    Wanted,
-    build_graph,
-    keep_within_limit,
-    measure,
-    wants_points,
-)
-from sfm_shapefit.pipeline.rigs import Rigid, may_be_checked, place_cameras, place_measured
+from sfm_shapefit.pipeline.gauge_choice import bring_to_gauge, bring_to_known
+from sfm_shapefit.pipeline.measure import MeasureRequest, build_graph, measure, wants_points
+from sfm_shapefit.pipeline.memory import count_work, keep_within_memory
+from sfm_shapefit.pipeline.placing import may_be_checked, place_cameras, place_measured
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
 from sfm_shapefit.pipeline.state import ModelState
+from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged
 from sfm_shapefit.placement.gauge import tell_scale
 from sfm_shapefit.placement.place import Placement
 
@@ -67,8 +63,8 @@ def measure_directions(state: ModelState, clock: Clock) -> ModelState:
     source, options = state.source, state.inputs.options
     with clock("directions"):
         checked = state.first is None and not state.rigid.has_scale  # offsets do what points do
-        tracks, samples = wants_points(source, options.nodes), source.economy.samples
-        wanted = Wanted(tracks, checked, samples, facts=True)
+        tracks, samples = wants_points(source, options.nodes), source.memory_plan.samples
+        wanted = MeasureRequest(tracks, checked, samples, facts=True)
         return replace(state, measured=measure(source, options.directions, clock, wanted))
 
 
@@ -80,37 +76,37 @@ def place_rigid_pieces(state: ModelState, clock: Clock) -> list[ModelState]:
     images, options, measured = state.source.images, state.inputs.options, state.measured
     with clock("solve"):
         graph = state.rigid.apply(build_graph(images, measured, options.nodes))
-        economy, graph = keep_within_limit(graph, state.source, measured, options)
-        measured = measured if economy.samples else replace(measured, errors=None)
-        limited, nodes = economy.limit(options.placement), options.nodes
+        work = count_work(state.source, measured.directions, options)
+        plan, graph = keep_within_memory(graph, work, options, state.source.memory_plan)
+        measured = measured if plan.samples else replace(measured, errors=None)
+        limited, nodes = plan.limit(options.placement), options.nodes
         place = partial(place_cameras, options=limited, nodes=nodes, clock=clock, near=state.near)
         if not (measured.checks and may_be_checked(graph)):
             measured = replace(measured, tracks=None)  # which are large
-        directions = Measured(directions=measured.directions)
-        state = replace(state, source=state.source.at(images, economy), measured=directions)
+        directions = MeasuredPairs(directions=measured.directions)
+        state = replace(state, source=state.source.at(images, plan), measured=directions)
         placements = place_measured(images, graph, measured, nodes, place)
     return [_begin_piece(state, placement) for placement in placements]
 
 
 def _begin_piece(state: ModelState, placement: Placement) -> ModelState:
-    """Return the state of one of the pieces, in the frame of all its cameras."""
     if placement.piece:
         free = np.zeros_like(state.inputs.fixed)
         inputs = replace(state.inputs.without_positions(), fixed=free)
         state = replace(
-            state, inputs=inputs, rigid=Rigid(free, None, None), near=None, first=None, warnings=()
+            state, inputs=inputs, rigid=FixedAndRigged(free, None, None), near=None, first=None, warnings=()
         )
-    economy, priors = state.source.economy.statement, state.inputs.known.priors
+    plan, priors = state.source.memory_plan.statement, state.inputs.known.priors
     if priors is not None:
         state = state.warned(*priors.notes)
-    if economy:
+    if plan:
         limit = f"max_memory_mb={state.inputs.options.memory.max_memory_mb}"
-        state = state.warned(f"to stay below {limit}, {economy}")
+        state = state.warned(f"to stay below {limit}, {plan}")
     if names := state.source.matches.missing_names:
         state = state.warned(
             f"the database lacks {counted(len(names), 'image')} of the model: {first_of(names)}"
         )
-    return choose_frame(replace(state, placement=placement))
+    return replace(state, placement=placement).framed()
 
 
 def adjust_cameras(state: ModelState, clock: Clock) -> ModelState:
@@ -120,7 +116,7 @@ def adjust_cameras(state: ModelState, clock: Clock) -> ModelState:
     is_small = state.placement.piece > 0 and num_cameras < _SMALLEST_ADJUSTED
     adjusts = options.placement.refines and options.freedom.adjusts_cameras(num_cameras)
     is_done = state.first is not None and state.held is None
-    if is_done or is_small or not (adjusts and state.source.economy.adjustment):
+    if is_done or is_small or not (adjusts and state.source.memory_plan.adjustment):
         return state
     with clock("adjustment"):
         try:
@@ -135,18 +131,19 @@ def judge_piece(state: ModelState, clock: Clock) -> ModelState:
     with clock("trust"):
         if state.inputs.pull_rad != 0.0 and not fit.all():  # else the given rotations are believed
             relative = ask_pairs(source, state.directions, clock.threads, state.among)
-        judged = judge(state.placement, source.economy.limit(state.inputs.options.placement))
+        judged = judge(state.placement, source.memory_plan.limit(state.inputs.options.placement))
         if not source.has_database:  # its points were made for one placement, and hold no second one
             judged = replace(judged, second_configuration=None)
         judged = _with_known_errors(judged, state).without_error_samples()
-        sure = None if source.has_database else fit[judged.cameras]
-        return _choose(state, doubt_cameras(judged, state.directions, relative, source.images, sure))
+        fitting = None if source.has_database else fit[judged.cameras]
+        return _choose(state, doubt_cameras(judged, state.directions, relative, source.images, fitting))
 
 
 def _with_known_errors(judged: Judged, state: ModelState) -> Judged:
     """Return the piece with the errors of the last adjustment, of the first placement if there is no other.
 
-    That knows nothing of a piece fewer than two of whose cameras had places then, or all of them the same.
+    The first placement knows no errors of a piece of which it has fewer than two cameras, or all at one
+    place.
     """
     images = state.source.images
     if state.adjustment is not None:
@@ -154,11 +151,11 @@ def _with_known_errors(judged: Judged, state: ModelState) -> Judged:
     if state.first is None or state.near is None:
         return judged
     centers = state.near.locations[judged.cameras]
-    there = np.isfinite(centers).all(axis=1)
-    if there.sum() < 2:
+    common = np.isfinite(centers).all(axis=1)
+    if common.sum() < 2:
         return judged
-    before, now = median_spread(centers[there]), median_spread(judged.locations[there])
-    return with_uncertainty(judged, images, state.first, before / now) if min(before, now) > 0.0 else judged
+    old, new = median_spread(centers[common]), median_spread(judged.locations[common])
+    return with_uncertainty(judged, images, state.first, old / new) if min(old, new) > 0.0 else judged
 
 
 def _choose(state: ModelState, judged: Judged) -> ModelState:
@@ -166,20 +163,20 @@ def _choose(state: ModelState, judged: Judged) -> ModelState:
     kept = select_trusted(judged, state.inputs.options.trust.min_trust)
     if state.held is None:
         kept |= state.inputs.fixed[judged.cameras]
-    return choose_frame(replace(state, placement=judged, kept=kept))
+    return replace(state, placement=judged, kept=kept).framed()
 
 
 def seed_model(state: ModelState, clock: Clock) -> ModelState:
     """Give the kept cameras points; once more where the pixels confirm a camera that was left out."""
     seeded = seed_points(state, clock)
     with clock("trust"):
-        sure = confirm_by_pixels(seeded)
-    if sure.any():
+        by_pixels = confirm_by_pixels(seeded)
+    if by_pixels.any():
         judged = state.judged
-        assessment = confirm_cameras(judged.assessment, sure[judged.cameras])
+        assessment = confirm_cameras(judged.assessment, by_pixels[judged.cameras])
         confirmed = _choose(state, replace(judged, assessment=assessment))
-        if (sure & ~seeded.images.is_posed).any():
-            seeded = seed_points(confirmed, clock, sure)
+        if (by_pixels & ~seeded.images.is_posed).any():
+            seeded = seed_points(confirmed, clock, by_pixels)
         else:
             seeded = replace(seeded, placement=confirmed.placement, kept=confirmed.kept)
     seeded = replace(seeded, kept=seeded.kept & seeded.images.is_posed[seeded.placement.cameras])

@@ -22,6 +22,7 @@ import numpy as np
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.pairs.essential import (
     concatenate_rotations,
@@ -30,14 +31,13 @@ from sfm_shapefit.pairs.essential import (
     refine_rough_rotations,
 )
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.gauge_choice import choose_frame
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
-from sfm_shapefit.pipeline.measure import Wanted, measure, wants_points
+from sfm_shapefit.pipeline.measure import MeasureRequest, measure, wants_points
+from sfm_shapefit.pipeline.placing import place_first
 from sfm_shapefit.pipeline.relative_rotations import estimate_here
-from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_first
 from sfm_shapefit.pipeline.state import ModelState
-from sfm_shapefit.placement.place import Near
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
+from sfm_shapefit.placement.place import InitialPlacement
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.scene.images import Images
@@ -75,12 +75,12 @@ def adjust_first_placement(
     source, options, images = state.source, state.inputs.options, state.source.images
     with clock("first placement"):
         is_free = not state.rigid.has_scale  # offsets do what points do
-        wanted = Wanted(tracks=wants_points(source, options.nodes), checked=is_free)
+        wanted = MeasureRequest(tracks=wants_points(source, options.nodes), checked=is_free)
         measured = measure(source, options.directions, clock, wanted)
         placement = place_first(images, state.rigid, measured, options, clock)
         directions = replace(measured, tracks=None)
         del measured  # arrays of all pairs
-        placed = choose_frame(replace(state, measured=directions, placement=placement))
+        placed = replace(state, measured=directions, placement=placement).framed()
         start = placed.placed()
         rows = start.posed_rows
         adjusted = adjust_thinly(
@@ -96,9 +96,9 @@ def adjust_first_placement(
         )
     rotations, centers = images.rotations.copy(), np.full((images.num_images, 3), np.nan)
     rotations[rows], centers[rows] = adjusted.images.rotations, adjusted.images.centers
-    there = np.isfinite(centers).all(axis=1)
-    common = mean_rotation_l1(images.rotations[there].transpose(0, 2, 1) @ rotations[there])
-    rotations[~there] = images.rotations[~there] @ common
+    known = np.isfinite(centers).all(axis=1)
+    common = mean_rotation_l1(images.rotations[known].transpose(0, 2, 1) @ rotations[known])
+    rotations[~known] = images.rotations[~known] @ common
     intrinsics = state.intrinsics.after(adjusted, images.lenses_of(adjusted.images))
     images = images.with_lenses_of(adjusted.images, adjusted.is_tried)
     if adjusted.refines_sensors:
@@ -107,9 +107,9 @@ def adjust_first_placement(
     return replace(
         state,
         source=source,
-        rigid=find_rigid_parts(source.images),
+        rigid=find_fixed_and_rigged(source.images),
         intrinsics=intrinsics,
-        near=Near(centers, placement.refined),
+        near=InitialPlacement(centers, placement.refined),
         first=adjusted,
     )
 
@@ -167,14 +167,14 @@ def average_near(rough: Images, relative: RelativeRotations, threads: int) -> Im
 
     Images that no pair ties to the largest component keep their own.
     """
-    own, sensors = rough.frames.rotations, rough.sensors.rotations[rough.lens_of]
+    given, sensors = rough.frames.rotations, rough.sensors.rotations[rough.lens_of]
     of_frames = relative_rotations_of_frames(relative, rough.frame_of, sensors)
     if not len(of_frames.pairs):
         return rough
-    averaged = average_relative_rotations(len(own), of_frames, threads)
+    averaged = average_relative_rotations(len(given), of_frames, threads)
     known = averaged.registered
-    common = mean_rotation_l1(averaged.rotations[known].transpose(0, 2, 1) @ own[known])
-    turned: FloatArray = np.where(known[:, None, None], averaged.rotations @ common, own)
+    common = mean_rotation_l1(averaged.rotations[known].transpose(0, 2, 1) @ given[known])
+    turned: FloatArray = np.where(known[:, None, None], averaged.rotations @ common, given)
     return rough.posed(turned, np.zeros_like(rough.frames.centers))
 
 

@@ -17,14 +17,15 @@ from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
 from sfm_shapefit.judgement.support import Support
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
-from sfm_shapefit.pipeline.measure import Measured
-from sfm_shapefit.pipeline.rigs import Rigid, find_rigid_parts
+from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged, find_fixed_and_rigged
 from sfm_shapefit.placement.gauge import Gauge
-from sfm_shapefit.placement.place import Near, Placement
+from sfm_shapefit.placement.gauge_rule import GaugeRule
+from sfm_shapefit.placement.place import InitialPlacement, Placement
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.matches import is_among
@@ -42,14 +43,14 @@ class ModelState:
     inputs: RunInputs
     source: MatchSource
     """The matches as the images see them, at the rotations and lenses that these have now."""
-    rigid: Rigid
+    rigid: FixedAndRigged
     intrinsics: RefinedIntrinsics
     """What may still change of lenses in doubt, and what became of them so far."""
-    near: Near | None = None
+    near: InitialPlacement | None = None
     """Where the adjustment of a first placement has the images."""
     first: Estimate | None = None
     """How a first placement was adjusted."""
-    measured: Measured = _LATER
+    measured: MeasuredPairs = _LATER
     """Directions of pairs and, until cameras are placed, what else was measured."""
     placement: Placement = _LATER
     """Where cameras stand, in the solver's units; then `judged`."""
@@ -84,7 +85,7 @@ class ModelState:
 
         InputError: if the fixed images stand at one place, or the solver does not go with rigs.
         """
-        rigid = find_rigid_parts(source.images, inputs.fixed)
+        rigid = find_fixed_and_rigged(source.images, inputs.fixed)
         if rigid.groups is not None:
             refuse_admm(inputs.options.placement.solver)
         source = replace(source, fixed=inputs.fixed if inputs.fixed.any() else None)
@@ -112,8 +113,8 @@ class ModelState:
         if self.adjustment is None:
             rigs = self.rigid.groups is not None
             return Freedom.asked(self.inputs.options.freedom, self.intrinsics.parts, rigs=rigs)
-        every, own = self.source.images.frames.ids, self.adjustment.images.frames.ids
-        freedom = self.adjustment.freedom.among(np.searchsorted(every, own), len(every))
+        every, adjusted = self.source.images.frames.ids, self.adjustment.images.frames.ids
+        freedom = self.adjustment.freedom.among(np.searchsorted(every, adjusted), len(every))
         return replace(freedom, parts=self.intrinsics.parts)
 
     @property
@@ -124,6 +125,20 @@ class ModelState:
         if not self.source.has_database and done and done.errors and done.errors.sigma_rad == 0.0:
             frames |= ~self.freedom.singled_out()
         return np.asarray(frames[images.frame_of])
+
+    @property
+    def gauge_rule(self) -> GaugeRule:
+        """What sets scale, origin and axes of the model."""
+        inputs = self.inputs
+        return GaugeRule(inputs.images, self.rigid, inputs.scale, inputs.known.priors, inputs.distances)
+
+    def framed(self) -> "ModelState":
+        """Return the same in the frame of the placed cameras that are kept, or of all; priors hold theirs."""
+        if self.held is not None:
+            return self
+        placed, kept = self.placement, slice(None) if self.kept is None else self.kept
+        frame = self.gauge_rule.choose(placed.cameras[kept], placed.locations[kept], placed.unit)
+        return replace(self, frame=frame)
 
     def warned(self, *warnings: str) -> "ModelState":
         """Return the same with more that the user should know."""
@@ -164,8 +179,8 @@ class ModelState:
 
     def pictures(self, images: Images, rows: IntArray) -> ModelPictures:
         """Return the keypoints of some images (r,), and their lenses."""
-        own, view = rows.tolist(), self.source.view
-        return ModelPictures(images.part(rows), lambda k: view.keypoints(own[k]), view.num_keypoints[rows])
+        chosen, view = rows.tolist(), self.source.view
+        return ModelPictures(images.part(rows), lambda k: view.keypoints(chosen[k]), view.num_keypoints[rows])
 
     def read_links(self, images: Images, advance: Advance, *, rejected: bool = False) -> Links:
         """Return what joins the keypoints of posed images, or matches of rejected pairs; rays are forgotten.

@@ -16,10 +16,12 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from sfm_shapefit.base.atomic_folder import atomic_folder
+from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, angle_between_deg
 from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.wording import counted, counted_are, first_of
+from sfm_shapefit.facts.tables import model_datum
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, model_of, read_model
 from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
@@ -27,12 +29,9 @@ from sfm_shapefit.files.colmap.pinholes import flats_of, flatten_model, write_fl
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
 from sfm_shapefit.files.nerf import nerf_text
-from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.pipeline.evaluate import model_datum
 from sfm_shapefit.report.mesh import ply_bytes
 from sfm_shapefit.rotations.gravity import DOWN, turn_upright
 from sfm_shapefit.scene.level import find_up
-from sfm_shapefit.solver.options import SolverOptions
 
 if TYPE_CHECKING:
     import pycolmap
@@ -95,10 +94,10 @@ def workspace(
     if level not in LEVELS:
         raise InputError(f"level must be auto or never, got {level!r}")
     refuse_no_folder(Path(images))
-    clock = Clock.of(progress, SolverOptions())
+    clock = Clock.of(progress)
     with clock("read"):
         read = read_by_itself(model_of(model), with_lenses=True)
-        turn, said = _level(read, model) if level == "auto" else (None, "its axes stay, as asked")
+        turn, statement = _level(read, model) if level == "auto" else (None, "its axes stay, as asked")
         leveled = read.reconstruction if turn is None else transform_model(read.reconstruction, turn)
     protect = [images, *([model] if isinstance(model, Path | str) else [])]
     with atomic_folder(out, protect=protect) as folder:
@@ -121,12 +120,11 @@ def workspace(
             made = flatten_model(colored, flats)
             _write_models(read_model(made), folder)
     return Workspace(
-        folder=Path(out), reconstruction=made, level=said, warnings=(*read.notes, *_warn(made, reasons))
+        folder=Path(out), reconstruction=made, level=statement, warnings=(*read.notes, *_warn(made, reasons))
     )
 
 
 def _warn(made: "pycolmap.Reconstruction", reasons: Mapping[str, str]) -> Iterator[str]:
-    """Yield what is missing, a sentence each."""
     for why in dict.fromkeys(reasons.values()):
         names = [name for name, reason in reasons.items() if reason == why]
         yield f"{counted_are(len(names), 'image')} left out ({why}): {first_of(names)}"
@@ -154,7 +152,6 @@ def _level(read: ColmapModel, source: ModelSource) -> tuple[Similarity | None, s
 
 
 def _write_models(model: ColmapModel, folder: Path) -> None:
-    """Write a model as each program looks for it."""
     sparse, stereo = folder / "sparse", folder / "stereo"
     (sparse / "0").mkdir(parents=True)
     write_model(model.reconstruction, sparse / "0")

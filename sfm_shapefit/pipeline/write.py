@@ -7,30 +7,35 @@ that were joined stand in `joined_0` in one world too.
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_file, atomic_folder
-from sfm_shapefit.base.display import Reported, Writers, write_by
+from sfm_shapefit.base.display import Reported, Writers
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.paths import refuse_irregular_file
+from sfm_shapefit.base.paths import file_of, refuse_irregular_file, refuse_no_folder
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
+from sfm_shapefit.base.threads import count_threads
+from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.map_result import JoinedModel, MapResult
 from sfm_shapefit.facts.placed import IN_MEMORY, folder_of
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import covariance_of, covariances_text, own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
-from sfm_shapefit.files.colmap.seed import write_model
+from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
+from sfm_shapefit.files.colmap.seed import pick_points, write_model
 from sfm_shapefit.files.options import MADE_FIRST, SIDECARS
-from sfm_shapefit.pipeline.colors import Result, with_colors
 
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
 
+Result = TypeVar("Result", bound=LocateResult | GraphResult | MapResult | JoinedModel)
+
+_PICKED = 1000  # points that are asked for a color; one that has it is enough
 _WRITTEN = {".html", ".glb", ".ply", ".csv", ".json", ".tum", ".txt"}
 """Suffixes of single files that commands write, perhaps into the folder of a model."""
 _READ = {
@@ -94,8 +99,68 @@ def deliver(found: Result, out: Path | str, options: WriteOptions) -> Result:
     return found
 
 
+def has_colors(found: LocateResult | GraphResult | MapResult | JoinedModel) -> bool:
+    """Return whether points of a result, of several models the largest, have colors; none need no color."""
+    if isinstance(found, GraphResult):
+        return True
+    shown = found.models[0].located if isinstance(found, MapResult) else found
+    picked = pick_points(shown.model if isinstance(shown, LocateResult) else shown.reconstruction, _PICKED)
+    return not picked.num_all or bool(picked.colors.any())
+
+
+def with_colors(found: Result, images: Path | str) -> Result:
+    """Return a result whose points without a color have that of the pictures which see them.
+
+    Pictures that are missing or cannot be read give none, and a warning says so.
+
+    Args:
+        found: the result; a bare graph has no points, and stays as it is.
+        images: folder of the pictures.
+
+    Raises:
+        InputError: if the folder is none.
+    """
+    if isinstance(found, GraphResult):
+        return found
+    refuse_no_folder(Path(images))
+    pictures = PictureFolder(Path(images), count_threads())
+    unread: set[str] = set()
+    colored: Any = _colored(found, pictures, unread)
+    warnings = [*found.warnings, *_color_warnings(pictures.folder, found.image_names, sorted(unread))]
+    if isinstance(found, JoinedModel):
+        told: dict[str, Any] = {"facts": replace(found.facts, warnings=warnings)}
+    else:
+        told = {"warnings": tuple(warnings)}
+    result: Result = replace(colored, **told)
+    return result
+
+
+def _colored(found: Any, pictures: PictureFolder, unread: set[str]) -> Any:
+    """Return a result with colors; names of unreadable pictures are added to `unread`."""
+    if isinstance(found, MapResult):
+        models = [replace(one, located=_colored(one.located, pictures, unread)) for one in found.models]
+        joined = [_colored(one, pictures, unread) for one in found.joined]
+        return replace(found, models=tuple(models), joined=tuple(joined))
+    if isinstance(found, JoinedModel):
+        model, missed = color_model(found.reconstruction, pictures)
+        unread.update(missed)
+        return replace(found, reconstruction=model)
+    seed, missed = found.seed.colored(pictures)
+    unread.update(missed)
+    further = [_colored(one, pictures, unread) for one in found.further]
+    return replace(found, seed=seed, further=tuple(further))
+
+
+def _color_warnings(folder: Path, names: Sequence[str], unread: Sequence[str]) -> list[str]:
+    missing, said = sum(file_of(folder, name) is None for name in names), []
+    if missing:
+        said.append(f"{folder} lacks {missing} of {counted(len(names), 'image')}: is it the right folder?")
+    if unread:
+        said.append(f"{counted(len(unread), 'picture')} in {folder} cannot be read: {first_of(unread)}")
+    return said
+
+
 def _inputs_of(found: Any) -> list[Path]:
-    """Return the files and folders that a result was made of."""
     if isinstance(found, LocateResult):
         return [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
     if isinstance(found, MapResult) and found.images is not None:
@@ -109,7 +174,6 @@ def _inputs_of(found: Any) -> list[Path]:
 def _write_files(
     found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions
 ) -> None:
-    """Write the files of one placed model or graph, or of models that were joined."""
     if isinstance(found, LocateResult):
         write_model(found.model, folder)
     elif isinstance(found, JoinedModel):
@@ -205,7 +269,6 @@ def _is_same(page: Path, other: Path) -> bool:
 
 
 def _draw_page(found: Any) -> str:
-    """Return the page of a result's report, as notebooks show it."""
     from sfm_shapefit.report.page import report_html
 
     return report_html(_drawing_of(found), found.facts)
@@ -233,4 +296,5 @@ def _write_report(found: Any, page: Path, images: Path | str) -> bool:
     return pictures is None or bool(pictures)
 
 
-write_by(Writers(_draw_page, write_page, write_result))
+WRITERS = Writers(_draw_page, write_page, write_result)
+"""What `base.display` writes results by."""

@@ -129,7 +129,6 @@ def direction_spread(num_nodes: int, edges: IntArray, directions: FloatArray) ->
 
 
 def _cause(num_pairs: int, narrowness: float, sigma: float) -> Looseness:
-    """Return what makes a single camera loose."""
     if num_pairs <= FEW_PAIRS:
         return Looseness.FEW_PAIRS
     if narrowness < NEARLY_PARALLEL:

@@ -17,13 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
-from sfm_shapefit.base.geometry import (
-    METRIC_SIGMA,
-    Similarity,
-    compose,
-    fit_similarity,
-    principal_lengths,
-)
+from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose, fit_similarity, principal_lengths
 from sfm_shapefit.placement.gauge import Free, Gauge, fit_to_priors
 from sfm_shapefit.scene.given import (
     FEWEST_CONTROL_POINTS,
@@ -115,8 +109,8 @@ def fit_control_points(
 
     It keeps the scale if it may not `resize`.
     """
-    there: BoolArray = np.asarray(np.isfinite(positions).all(axis=1))
-    rows = np.flatnonzero(there & ~control.is_check)
+    known: BoolArray = np.asarray(np.isfinite(positions).all(axis=1))
+    rows = np.flatnonzero(known & ~control.is_check)
     source, target = positions[rows], control.positions[rows]
     reason = why_too_few(target, "can be triangulated")
     if reason:
@@ -143,9 +137,9 @@ def fit_control_points(
             f"the control points contradict one another: those that agree, {int(fits.sum())} of {len(rows)}, "
             "lie on a line but for their errors; check coordinates and marks"
         )
-    fitting = np.zeros(len(there), dtype=np.bool_)
+    fitting = np.zeros(len(known), dtype=np.bool_)
     fitting[rows[fits]] = True
-    residuals = np.where(there[:, None], motion.apply(positions) - control.positions, np.nan)
+    residuals = np.where(known[:, None], motion.apply(positions) - control.positions, np.nan)
     size = float(np.linalg.norm(target[fits] - target[fits].mean(axis=0)))
     return ControlFit(motion, fitting, sigma, residuals, sigma / size)
 
@@ -160,7 +154,7 @@ def control_gauge(before: Gauge, control: ControlPoints, fit: ControlFit, *, res
     shift = axes.T @ motion.translation
     total = Similarity(scale=motion.scale, rotation=np.eye(3), translation=shift)
     used = int(np.sum(~control.is_check & np.isfinite(fit.residuals[:, 0])))
-    told = f"the scale is known to {100.0 * fit.scale_sigma:.2g} %"
+    sentence = f"the scale is known to {100.0 * fit.scale_sigma:.2g} %"
     agree = f"{control.statement}; {int(fit.fitting.sum())} of {used} agree, to {fit.sigma:.3g} per axis"
     gauge = replace(
         before,
@@ -174,11 +168,13 @@ def control_gauge(before: Gauge, control: ControlPoints, fit: ControlFit, *, res
         return gauge
     warning = ""
     if fit.scale_sigma > METRIC_SIGMA:
-        warning = f"{told} only, so it is not metric: the control points contradict one another, or the model"
+        warning = (
+            f"{sentence} only, so it is not metric: the control points contradict one another, or the model"
+        )
     return replace(
         gauge,
         scale="control points",
-        statement=f"control points: {agree}; origin and axes: theirs; {told}",
+        statement=f"control points: {agree}; origin and axes: theirs; {sentence}",
         warning=warning,
         scale_sigma=fit.scale_sigma,
     )

@@ -230,7 +230,6 @@ def _in_triangle(graph: ViewGraph) -> BoolArray:
 
 
 def _plan_placement(piece: ViewGraph, options: PlacementOptions) -> PlannedPlacement:
-    """Return what a placement would do with the largest piece."""
     choice = choose_method(piece, options.solver)
     second = has_second_start(piece)
     if options.objective == "shapefit":

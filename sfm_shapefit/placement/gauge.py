@@ -186,22 +186,22 @@ def distance_gauge(
         raise InputError(f"the cameras {name} coincide, so their distance sets no scale; choose two others")
     scale, weights, sigma = _scale_of_distances(apart, distances)
     residuals = scale * apart - distances
-    said = f"{names[0]} are {distances[0]:g} apart"
+    sentence = f"{names[0]} are {distances[0]:g} apart"
     if len(distances) > 1:
         worst = int(np.argmax(np.abs(residuals)))
-        said = (
+        sentence = (
             f"{int(np.sum(weights >= 0.5))} of {len(distances)} known distances agree, on a scale known to "
             f"{100.0 * sigma:.2g} %; {names[worst]} miss theirs most, by {residuals[worst]:.3g}"
         )
     similarity = _keep_axes(scale, -scale * locations.mean(axis=0))
-    statement = f"distance: {said}; origin: the cameras' centroid, axes: the input's"
+    statement = f"distance: {sentence}; origin: the cameras' centroid, axes: the input's"
     return Gauge(
         similarity=similarity,
         scale="distance",
         statement=statement,
-        scale_statement=f"distance: {said}",
+        scale_statement=f"distance: {sentence}",
         scale_sigma=sigma if len(distances) > 1 else None,
-        warning=f"the known distances contradict one another: {said}" if sigma > METRIC_SIGMA else "",
+        warning=f"the known distances contradict one another: {sentence}" if sigma > METRIC_SIGMA else "",
     )
 
 

@@ -122,17 +122,17 @@ def join_pieces(cameras: PieceCameras, ties: PieceTies) -> dict[int, PieceJoin |
     A join may be refused; where there was none to judge, the reason stands in its place.
     """
     whole = _Evidence.of(cameras, ties)
-    told: dict[int, PieceJoin | str] = {}
+    outcomes: dict[int, PieceJoin | str] = {}
     waiting = np.arange(cameras.num_pieces)
     while len(waiting) > 1:
         rest = waiting[1:]
         grown = dict(_grow(whole.part(waiting)))
         accepted = [k for k, join in grown.items() if isinstance(join, PieceJoin) and not join.reason]
         for k in rest.tolist():
-            if k in accepted or k not in told or told[k] == UNTIED:
-                told[k] = grown.get(k, UNTIED)
+            if k in accepted or k not in outcomes or outcomes[k] == UNTIED:
+                outcomes[k] = grown.get(k, UNTIED)
         waiting = np.setdiff1d(rest, accepted)
-    return told
+    return outcomes
 
 
 class _Evidence(NamedTuple):
@@ -185,13 +185,13 @@ class _Evidence(NamedTuple):
     def part(self, pieces: IntArray, chosen: BoolArray | None = None) -> "_Evidence":
         """Return some pieces, by their numbers among all, and their pairs, or the chosen ones (k,)."""
         here = np.isin(self.numbers, pieces)
-        own = here[self.cameras.piece_of]
-        new, camera_of = np.cumsum(here) - 1, np.cumsum(own) - 1
+        cameras = here[self.cameras.piece_of]
+        new, camera_of = np.cumsum(here) - 1, np.cumsum(cameras) - 1
         kept = np.asarray(here[self.pieces].all(axis=1) & (True if chosen is None else chosen))
         turns, *known = (column[kept] for column in self.votes[1:])
         votes = Votes(new[self.pieces[kept]], turns, *known)
         return _Evidence(
-            self.cameras.subset(own, new[self.cameras.piece_of[own]], here),
+            self.cameras.subset(cameras, new[self.cameras.piece_of[cameras]], here),
             self.ties.subset(kept).renumbered(camera_of),
             self.aside.subset(kept).renumbered(camera_of),
             votes,
@@ -230,10 +230,10 @@ class _Joint(NamedTuple):
         pieces, count = self.evidence.pieces, self.evidence.cameras.num_pieces
         support = np.zeros((count, count), dtype=np.int64)
         for two in np.unique(pieces, axis=0):
-            own = (pieces == two).all(axis=1) & self.agrees & counted
-            weight = self.evidence.weigh(own)
-            if weight < FEWEST_PAIRS <= max(weight, int(own.sum())) + 1:
-                (points,) = self.evidence.coinciding(two, own, self.between(two))
+            between = (pieces == two).all(axis=1) & self.agrees & counted
+            weight = self.evidence.weigh(between)
+            if weight < FEWEST_PAIRS <= max(weight, int(between.sum())) + 1:
+                (points,) = self.evidence.coinciding(two, between, self.between(two))
                 weight = FEWEST_PAIRS if _speaks(points, 0) else weight
             support[*two] = support[*two[::-1]] = weight
         return support
@@ -393,17 +393,17 @@ def _find_rivals(joint: _Joint, false: IntArray) -> _Rivals:
     named = np.isin(evidence.rows, false)
     in_doubt, beaten = np.zeros((2, len(evidence.rows)), dtype=np.bool_)
     for two in np.unique(evidence.pieces[~joint.agrees], axis=0):
-        own = (evidence.pieces == two).all(axis=1)
-        agreeing = own & joint.agrees
+        between = (evidence.pieces == two).all(axis=1)
+        agreeing = between & joint.agrees
         part = evidence.part(evidence.numbers[two], ~joint.agrees)
         for rival, most_agree in _rivals_among(part):
             if not most_agree and evidence.weigh(agreeing) < FEWEST_PAIRS - 1:
                 break  # it is refused anyhow
-            there = _join_of(rival, 1, ~rival.agrees)
-            if there.reason:
+            elsewhere = _join_of(rival, 1, ~rival.agrees)
+            if elsewhere.reason:
                 continue
-            others = own & np.isin(evidence.rows, rival.evidence.rows[rival.agrees])
-            joins = joint.between(two), there.to_from_piece
+            others = between & np.isin(evidence.rows, rival.evidence.rows[rival.agrees])
+            joins = joint.between(two), elsewhere.to_from_piece
             counts = evidence.coinciding(two, agreeing | others, *joins)
             if agreeing.any() and _speaks(*counts[::-1]):
                 beaten = beaten | agreeing
@@ -412,7 +412,7 @@ def _find_rivals(joint: _Joint, false: IntArray) -> _Rivals:
             if most_agree and weight >= _FEWEST_RIVALS:
                 named = named | others
                 if weight >= _RIVAL_SHARE * evidence.weigh(agreeing) and not _speaks(*counts):
-                    in_doubt |= own
+                    in_doubt |= between
             if _speaks(counts[0], 0):
                 break
     return _Rivals(named, in_doubt, evidence.rows[beaten])
@@ -442,13 +442,13 @@ def _join_of(joint: _Joint, k: int, rivals: BoolArray) -> PieceJoin:
     """Return the join of one piece, refused if it is uncertain."""
     evidence, standing = joint.evidence, joint.standing
     middles, size = evidence.cameras.middles(), evidence.cameras.sizes()[k]
-    own = (evidence.pieces == k).any(axis=1)
+    touching = (evidence.pieces == k).any(axis=1)
     sigmas = np.sqrt(np.diagonal(joint.covariances[k]))
     scale_sigma, center_sigma = float(sigmas[3]), float(np.linalg.norm(sigmas[4:]))
     turn_sigma_deg = float(np.degrees(np.linalg.norm(sigmas[:3])))
-    agreeing, against = own & joint.agrees, own & ~joint.agrees
+    agreeing, against = touching & joint.agrees, touching & ~joint.agrees
     shared = int(np.sum(evidence.ties.is_shared & agreeing))
-    pairs = f"{int(agreeing.sum())} of {counted(int(own.sum()), 'pair')} of images between them"
+    pairs = f"{int(agreeing.sum())} of {counted(int(touching.sum()), 'pair')} of images between them"
     same = f", {shared} by {'an image' if shared == 1 else 'images'} that both have" if shared else ""
     return PieceJoin(
         piece=int(evidence.numbers[k]),
@@ -459,7 +459,7 @@ def _join_of(joint: _Joint, k: int, rivals: BoolArray) -> PieceJoin:
         center_sigma=float(standing.scales[k] * size * center_sigma),
         agreeing=evidence.rows[agreeing],
         contradicting=evidence.rows[against],
-        rivals=evidence.rows[own & rivals],
+        rivals=evidence.rows[touching & rivals],
         solved=joint.solved,
         evidence=pairs + same,
         reason=uncertainty(scale_sigma, turn_sigma_deg, center_sigma),

@@ -12,11 +12,11 @@ from sfm_shapefit.refinement.near import follow_cameras
 
 def move_cameras(placement: Placement, locations: FloatArray) -> Placement:
     """Return the placement with k cameras at `locations` (k, 3), NaN unmoved, and its points after them."""
-    refined, before = placement.refined, placement.locations
+    refined, earlier = placement.refined, placement.locations
     has_location = np.isfinite(locations).all(axis=1)
     moved = refined.locations.copy()
-    moved[: len(before)][has_location] = locations[has_location]
-    by = float(np.median(np.linalg.norm(moved[: len(before)] - before, axis=1))) / median_spread(before)
+    moved[: len(earlier)][has_location] = locations[has_location]
+    by = float(np.median(np.linalg.norm(moved[: len(earlier)] - earlier, axis=1))) / median_spread(earlier)
     adjusted = replace(
         refined,
         locations=follow_cameras(placement.measured_part(), moved),

@@ -144,8 +144,8 @@ def _rays_of(cameras: PieceCameras, ties: PieceTies) -> _Rays:
     found = []
     pair_of = ties.pair_of
     for way, rays in enumerate((ties.matches.rays_i, ties.matches.rays_j)):
-        there = np.isfinite(ties.points[:, 1 - way]).all(axis=1)
-        rows = _thinned(np.flatnonzero(there), pair_of)
+        known = np.isfinite(ties.points[:, 1 - way]).all(axis=1)
+        rows = _thinned(np.flatnonzero(known), pair_of)
         pairs = pair_of[rows]
         eyes, others = ties.matches.pairs[pairs, way], ties.matches.pairs[pairs, 1 - way]
         looks = np.einsum("rk,rkl->rl", rays[rows], cameras.rotations[eyes])

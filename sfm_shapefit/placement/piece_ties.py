@@ -12,12 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_of_parts
-from sfm_shapefit.base.geometry import (
-    mean_rotation_l1,
-    median_spread,
-    nearest_rotations,
-    rotation_angles_deg,
-)
+from sfm_shapefit.base.geometry import mean_rotation_l1, median_spread, nearest_rotations, rotation_angles_deg
 from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pairs.estimate import estimate_directions
@@ -153,13 +148,15 @@ def collect_votes(cameras: PieceCameras, ties: PieceTies) -> Votes:
     soundness = np.full(k, _SHARED_SOUNDNESS)
     apart = np.flatnonzero(~ties.is_shared)
     numbered = replace(ties.matches.rays_of(apart), pairs=_numbered(len(apart)))
-    found = estimate_relative_rotations(numbered)
-    rows = apart[found.pairs[:, 0] // 2]
-    between[rows] = found.rotations
-    least = np.maximum(np.linalg.eigvalsh(found.information)[:, 0], 1e-9) if len(rows) else np.ones(0)
+    estimated = estimate_relative_rotations(numbered)
+    rows = apart[estimated.pairs[:, 0] // 2]
+    between[rows] = estimated.rotations
+    least = np.maximum(np.linalg.eigvalsh(estimated.information)[:, 0], 1e-9) if len(rows) else np.ones(0)
     sigmas[rows] = np.minimum(np.degrees(least**-0.5), 90.0)
-    believed = found.weight_shares * np.log(np.maximum(found.num_matches, 1))
-    soundness[rows] = np.where(found.are_sound(0.0), np.maximum(believed, _LEAST_SOUNDNESS), _LEAST_SOUNDNESS)
+    believed = estimated.weight_shares * np.log(np.maximum(estimated.num_matches, 1))
+    soundness[rows] = np.where(
+        estimated.are_sound(0.0), np.maximum(believed, _LEAST_SOUNDNESS), _LEAST_SOUNDNESS
+    )
     turns = cameras.rotations[i].transpose(0, 2, 1) @ between.transpose(0, 2, 1) @ cameras.rotations[j]
     return Votes(cameras.piece_of[[i, j]].T, turns, sigmas, soundness)
 
@@ -196,13 +193,13 @@ def _elect(votes: Votes, has_turn: BoolArray) -> Iterator[tuple[float, int, int,
     """Yield, of every two pieces with votes, the support of the turn that most agree with, and the turn."""
     for first, second in np.unique(votes.pieces[has_turn], axis=0).tolist():
         rows = np.flatnonzero(has_turn & (votes.pieces == [first, second]).all(axis=1))
-        own, sigmas, soundness = votes.turns[rows], votes.sigmas_deg[rows], votes.soundness[rows]
-        near = rotation_angles_deg(own[:, None].transpose(0, 1, 3, 2) @ own[None]) <= AGREEMENT_DEG
+        turns, sigmas, soundness = votes.turns[rows], votes.sigmas_deg[rows], votes.soundness[rows]
+        near = rotation_angles_deg(turns[:, None].transpose(0, 1, 3, 2) @ turns[None]) <= AGREEMENT_DEG
         support = near @ (soundness / np.hypot(sigmas, 1.0))
         chosen = int(np.argmax(support))
-        turn = mean_rotation_l1(own[near[chosen]])
+        turn = mean_rotation_l1(turns[near[chosen]])
         for _ in range(_MEAN_STEPS):
-            turn = _mean(own, sigmas, soundness, turn)
+            turn = _mean(turns, sigmas, soundness, turn)
         yield float(support[chosen]), first, second, turn
 
 

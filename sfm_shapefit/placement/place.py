@@ -36,7 +36,7 @@ _MOST_WATCHED = 100_000
 """Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
 
-class Near(NamedTuple):
+class InitialPlacement(NamedTuple):
     """Where an adjustment has cameras already."""
 
     locations: FloatArray
@@ -164,7 +164,7 @@ def place_pieces(
     measured: MeasuredGraph,
     options: PlacementOptions,
     *,
-    near: Near | None = None,
+    near: InitialPlacement | None = None,
     certified: bool = True,
     on_iteration: OnIteration | None = None,
 ) -> Iterator[Placement]:
@@ -194,18 +194,18 @@ def place_pieces(
     else:
         pieces = order_pieces(measured)
         refuse_without_triangle(measured, pieces)
-    how = _How(options, near, certified)
+    how = _PieceOptions(options, near, certified)
     yield _place_piece(measured, pieces, 0, how, on_iteration)
     for k in range(1, count_large(pieces, measured)):
         with suppress(UnsolvableError):
             yield _place_piece(measured, pieces, k, how)
 
 
-class _How(NamedTuple):
+class _PieceOptions(NamedTuple):
     """How pieces are placed; see `place_pieces`."""
 
     options: PlacementOptions
-    near: Near | None
+    near: InitialPlacement | None
     certified: bool
 
 
@@ -214,7 +214,7 @@ def _place_piece(
     measured: MeasuredGraph,
     pieces: list[RigidPiece],
     k: int,
-    how: _How,
+    how: _PieceOptions,
     on_iteration: OnIteration | None = None,
 ) -> Placement:
     """Solve piece k, refine it robustly, and see which directions agree."""
@@ -258,7 +258,7 @@ def _place_piece(
 def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placement:
     """Return a placement with other locations of the same nodes, and which directions agree with these.
 
-    What was judged of a placement is not of these.
+    Judgements of the placement do not hold for the new locations, and are left out.
     """
     moved = {item.name: getattr(placement, item.name) for item in fields(Placement)}
     moved["refined"] = refined

@@ -45,9 +45,9 @@ def compare_with_priors(
     positions, off, errors = np.full((n, 3), np.nan), np.full(n, np.nan), np.full(n, np.nan)
     positions[rows] = priors.known.positions
     off[rows] = np.linalg.norm(priors.known.off(centers), axis=1)
-    there = np.isfinite(off)
-    count, unknowns = max(int(there.sum()), 1), ALL_FREE.unknowns
-    level = residual_level(off[there], unknowns, robust=count >= FEWEST_CHECKED) if there.any() else 0.0
+    known = np.isfinite(off)
+    count, unknowns = max(int(known.sum()), 1), ALL_FREE.unknowns
+    level = residual_level(off[known], unknowns, robust=count >= FEWEST_CHECKED) if known.any() else 0.0
     level *= (3 * count / max(3 * count - unknowns, 1)) ** 2  # a level of few is not well known itself
     least = max(level, _ROUNDING * median_spread(priors.known.positions))
     errors[rows] = np.fmax(priors.known.sigmas(), least)

@@ -23,7 +23,7 @@ def better_reading(source: FloatArray, priors: PositionPriors) -> str:
     if len(source) < _FEWEST:
         return ""
     target = target - np.median(target, axis=0)
-    off = {said: _off(source, target @ reading.T) for said, reading in _readings(priors).items()}
+    off = {words: _off(source, target @ reading.T) for words, reading in _readings(priors).items()}
     best = min(off, key=off.__getitem__)
     if _BETTER * off[best] >= _off(source, target):
         return ""

@@ -41,9 +41,9 @@ def pull_to_priors(
     the placement. UnsolvableError if the factor would take more memory than they allow.
     """
     part, refined = placement.measured_part(), placement.refined
-    own = priors.of(placement.nodes).known
+    known = priors.of(placement.nodes).known
     start = gauge.similarity.apply(refined.locations)
-    anchors = _anchor(start, own, np.eye(3) if gauge.axes is None else gauge.axes)
+    anchors = _anchor(start, known, np.eye(3) if gauge.axes is None else gauge.axes)
     levels = np.radians(np.array(refined.levels_deg))
     moved = refine_anchored(part, start, levels, anchors, max_bytes=options.solver.factor_bytes)
     by = float(np.median(np.linalg.norm((moved - start)[: len(placement.cameras)], axis=1)))

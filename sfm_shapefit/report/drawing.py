@@ -81,12 +81,12 @@ class Cameras:
     @property
     def ellipsoids(self) -> FloatArray:
         """(n, 3, 3) rows: half axes of the ellipsoids of one standard deviation, the longest last; or NaN."""
-        found = np.full(self.covariances.shape, np.nan)
+        axes = np.full(self.covariances.shape, np.nan)
         known = np.isfinite(self.covariances).all(axis=(1, 2))
         variances, vectors = np.linalg.eigh(self.covariances[known])
         lengths = np.sqrt(np.maximum(variances, 0.0))
-        found[known] = lengths[:, :, None] * vectors.transpose(0, 2, 1)
-        return found
+        axes[known] = lengths[:, :, None] * vectors.transpose(0, 2, 1)
+        return axes
 
 
 class CameraColumn(NamedTuple):
@@ -210,29 +210,29 @@ def build_drawing(
         certified: (n, d) locations at the convex optimum, NaN where there are none; unknown if None.
     """
     poses = _unknown_poses(len(cameras)) if poses is None else poses
-    own = _cameras(cameras, poses)
-    positions = own.centers[own.placed]
+    camera_columns = _cameras(cameras, poses)
+    positions = camera_columns.centers[camera_columns.placed]
     return Drawing(
-        cameras=own,
-        pairs=_pairs(pairs, own, certified),
+        cameras=camera_columns,
+        pairs=_pairs(pairs, camera_columns, certified),
         points=_points(points, positions),
-        axes=view_axes(poses.rotations[own.placed]),
+        axes=view_axes(poses.rotations[camera_columns.placed]),
         frustum_depth=_frustum_depth(positions),
     )
 
 
 def poses_of(images: Images | None, names: Sequence[str]) -> Poses:
     """Return rotations, centers and pictures of images, by name; NaN for names that none has."""
-    found = _unknown_poses(len(names))
+    poses = _unknown_poses(len(names))
     if images is None:
-        return found
+        return poses
     row_of = {name: row for row, name in enumerate(names)}
     rows = [k for k, name in enumerate(images.names) if name in row_of]
-    own = [row_of[images.names[k]] for k in rows]
+    members = [row_of[images.names[k]] for k in rows]
     halves = images.sizes_px[rows] / (2.0 * images.focal_lengths_px[rows, None])
-    found.rotations[own], found.centers[own] = images.rotations[rows], images.centers[rows]
-    found.half_sizes[own] = np.clip(halves, *_HALF_SIZES)
-    return found
+    poses.rotations[members], poses.centers[members] = images.rotations[rows], images.centers[rows]
+    poses.half_sizes[members] = np.clip(halves, *_HALF_SIZES)
+    return poses
 
 
 def frustum_corners(drawing: Drawing, rows: IntArray, centers: FloatArray) -> FloatArray:
@@ -252,13 +252,13 @@ def input_centers(drawing: Drawing) -> FloatArray | None:
 
     None where the input has no centers, or they all coincide.
     """
-    before, after = drawing.cameras.poses.centers, drawing.cameras.centers
-    common = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
-    if common.sum() < _FEWEST_FITTED or not np.ptp(before[common], axis=0).max() > 0.0:
+    given, after = drawing.cameras.poses.centers, drawing.cameras.centers
+    common = np.isfinite(given).all(axis=1) & np.isfinite(after).all(axis=1)
+    if common.sum() < _FEWEST_FITTED or not np.ptp(given[common], axis=0).max() > 0.0:
         return None
     if drawing.input_is_aligned:
-        return before
-    return fit_similarity_l1(before[common], after[common]).apply(before)
+        return given
+    return fit_similarity_l1(given[common], after[common]).apply(given)
 
 
 def view_axes(rotations: FloatArray) -> FloatArray:

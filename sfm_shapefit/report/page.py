@@ -39,13 +39,7 @@ from sfm_shapefit.report.charts import (
 )
 from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, input_centers
 from sfm_shapefit.report.first_screen import banner, scene_name, tiles
-from sfm_shapefit.report.sentences import (
-    MAX_TEXT,
-    Hint,
-    first_looks,
-    shorten,
-    summary_sentences,
-)
+from sfm_shapefit.report.sentences import MAX_TEXT, Hint, first_looks, shorten, summary_sentences
 
 MAX_PAIRS = 20_000  # pairs that the page lists and draws; with more it opens slowly
 _HIGH_TRUST = 0.95  # trust; the chart of trust leaves out cameras above, which need no look
@@ -289,11 +283,11 @@ def _subtitle(facts: Facts) -> str:
 
 def _look(hint: Hint, rank: IntArray, pairs: IntArray) -> dict[str, Any]:
     """Return a hint with the rows of the page; a pair that is not listed is only told."""
-    found = np.flatnonzero(pairs == (-1 if hint.pair is None else hint.pair))
+    rows = np.flatnonzero(pairs == (-1 if hint.pair is None else hint.pair))
     return {
         "text": hint.text,
         "camera": None if hint.camera is None else int(rank[hint.camera]),
-        "pair": int(found[0]) if len(found) else None,
+        "pair": int(rows[0]) if len(rows) else None,
     }
 
 
@@ -343,8 +337,8 @@ def _trust_note(drawing: Drawing) -> str:
     if not known:
         return ""
     who = f"{high:,} of {known:,} {drawing.noun}s"
-    said = f"{who} have a trust of {_HIGH_TRUST} or more (1 is as good as it gets)"
-    return f"{said}; the least trusted others are shown." if high < known else f"{said}."
+    sentence = f"{who} have a trust of {_HIGH_TRUST} or more (1 is as good as it gets)"
+    return f"{sentence}; the least trusted others are shown." if high < known else f"{sentence}."
 
 
 def _histogram_note(residuals_deg: Mapping[str, FloatArray]) -> str:
@@ -363,9 +357,9 @@ def _tracks_note(points: PickedPoints) -> str:
         return ""
     share = float(np.mean(points.lengths <= 2))
     median = float(np.median(points.lengths))
-    said = f"Number of images that see a 3D point; a bar reaches to the next. The median is {median:.3g}."
+    sentence = f"Number of images that see a 3D point; a bar reaches to the next. The median is {median:.3g}."
     weak = f" {share:.0%} are seen by two only: nothing checks these." if share >= _NOTED_SHARE else ""
-    return f"{said}{weak}{_sample(points)}"
+    return f"{sentence}{weak}{_sample(points)}"
 
 
 def _reprojection_note(points: PickedPoints) -> str:

@@ -138,8 +138,6 @@ class _Answer(NamedTuple):
 
 
 class _Choice(NamedTuple):
-    """The most consistent of several answers."""
-
     answer: _Answer
     agree: BoolArray
     """(k,) which of all pairs are within 5 degrees of it."""
@@ -286,7 +284,6 @@ def _certify(answer: _Answer) -> DualCertificate | None:
 
 
 def _alone() -> AveragedRotations:
-    """Return the answer for a single image."""
     return AveragedRotations(
         rotations=np.eye(3)[None],
         registered=np.ones(1, dtype=np.bool_),
@@ -362,7 +359,6 @@ def _numbers(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> FloatA
 
 
 def _refuse(bad: BoolArray, pairs: IntArray, reason: str) -> None:
-    """Raise InputError for the first bad pair."""
     if bad.any():
         k = int(np.argmax(bad))
         raise InputError(f"pair {k} ({pairs[k, 0]}, {pairs[k, 1]}) {reason}")

@@ -62,8 +62,8 @@ class AveragedRotations(Displayed):
 
     def turned(self, frames: IntArray, sensor_rotations: FloatArray) -> "AveragedRotations":
         """Return the answer for images by their frames (m,) and the rotations of their sensors (m, 3, 3)."""
-        own = self.subset(frames)
-        return replace(own, rotations=sensor_rotations @ own.rotations)
+        chosen = self.subset(frames)
+        return replace(chosen, rotations=sensor_rotations @ chosen.rotations)
 
     @property
     def statement(self) -> str:

@@ -112,7 +112,6 @@ class AveragingSystem:
         return self._factor_of(3).refactor_blocks(self.pairs, diagonal, blocks)
 
     def _factor_of(self, block: int) -> Factor:
-        """Return the memory of the factor with blocks of that size."""
         assert self.plan is not None
         if block not in self._factors:
             self._factors[block] = allocate_factor(self.plan, block, threads=self.threads)
@@ -122,8 +121,8 @@ class AveragingSystem:
         """Factor the matrix of blocks (k, b, b); UnsolvableError if it is not positive definite."""
         b = blocks.shape[1]
         factor, diagonal = self._factor_of(b), self.sum_at_nodes(blocks)
-        own = diagonal[:, range(b), range(b)]
-        diagonal[:, range(b), range(b)] += RIDGE * own.mean()
+        entries = diagonal[:, range(b), range(b)]
+        diagonal[:, range(b), range(b)] += RIDGE * entries.mean()
         if not factor.refactor_blocks(self.pairs, diagonal, -blocks):
             raise UnsolvableError("the pairs do not determine the rotations to working precision")
 

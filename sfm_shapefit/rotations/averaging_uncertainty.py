@@ -91,10 +91,10 @@ def _ties(num_cameras: int, last: Linearized) -> BoolArray:
 
 def residual_variance(distances: FloatArray, leverages: FloatArray) -> float:
     """Return the variance of the residuals over that of the given information; 1 if they do not say."""
-    asked = (leverages <= MOST_LEVERAGE) & ~np.isnan(distances)
-    if not asked.any():
+    usable = (leverages <= MOST_LEVERAGE) & ~np.isnan(distances)
+    if not usable.any():
         return 1.0
-    return float(np.median(distances[asked] ** 2 / (1.0 - leverages[asked]))) / _MEDIAN_SQUARE
+    return float(np.median(distances[usable] ** 2 / (1.0 - leverages[usable]))) / _MEDIAN_SQUARE
 
 
 def _factored(
@@ -119,7 +119,7 @@ def _sampled(
     """Return the same from samples; the leverages are their mean."""
     n, k = system.num_nodes, len(system.pairs)
     rng = np.random.default_rng(_SEED)
-    own = np.linalg.inv(system.sum_at_nodes(last.blocks))
+    inverses = np.linalg.inv(system.sum_at_nodes(last.blocks))
     apply = system.block_operator(last.blocks)
     share = references / references.sum()
     total, roots, (i, j) = np.zeros(n), np.zeros((k, 3, 3)), system.pairs.T
@@ -132,7 +132,7 @@ def _sampled(
         x = system.solve_blocks(last.blocks, right, _REDUCTION)
         x = x - x[references].mean(axis=0)
         # A m = A x - L x.
-        around = x - np.einsum("nab,nb->na", own, apply(x))
+        around = x - np.einsum("nab,nb->na", inverses, apply(x))
         total += np.sum(((1.0 - share)[:, None] * around + share[:, None] * x) ** 2, axis=1)
-    exact = (1.0 - share) ** 2 * np.trace(own, axis1=1, axis2=2)
+    exact = (1.0 - share) ** 2 * np.trace(inverses, axis1=1, axis2=2)
     return (exact + total / _SAMPLES) / 3.0, np.full(k, (n - 1) / np.sum(~np.isnan(last.distances)))

@@ -51,7 +51,6 @@ def relative_rotations_of_frames(
 
 
 def _join(several: RelativeRotations) -> RelativeRotations:
-    """Return one relative rotation for each pair of frames."""
     supports = several.weight_shares * several.num_matches
     ordered = several.subset(np.lexsort((-supports, several.pairs[:, 1], several.pairs[:, 0])))
     pairs, first, group = np.unique(ordered.pairs, axis=0, return_index=True, return_inverse=True)

@@ -101,9 +101,9 @@ def find_videos(names: Sequence[str]) -> Videos:
     """Return the videos among names: ten images or more that only differ by their last number."""
     groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for image, name in enumerate(names):
-        found = _LAST_NUMBER.match(name)
-        if found:
-            groups.setdefault((found[1], found[3]), []).append((int(found[2]), image))
+        match = _LAST_NUMBER.match(name)
+        if match:
+            groups.setdefault((match[1], match[3]), []).append((int(match[2]), image))
     video_of, time_of = np.full(len(names), -1), np.full(len(names), -1)
     frames = [sorted(group) for group in groups.values() if len(group) >= _FEWEST_FRAMES]
     for video, group in enumerate(frames):
@@ -117,8 +117,8 @@ def confirm_videos(videos: Videos, relative: RelativeRotations) -> Videos:
     confirmed = np.zeros(videos.num_videos, dtype=np.bool_)
     inside, lags = _lags(videos, relative.pairs)
     for video in range(videos.num_videos):
-        own = inside & (videos.video_of[relative.pairs[:, 0]] == video)
-        counts, lag = relative.num_matches[own], lags[own]
+        of_video = inside & (videos.video_of[relative.pairs[:, 0]] == video)
+        counts, lag = relative.num_matches[of_video], lags[of_video]
         n = int(np.sum(videos.video_of == video))
         near, num_far = counts[lag == 1], max((n - _NEAR) * (n - _NEAR - 1) // 2, 1)
         matched = len(near) >= _MATCHED_SHARE * (n - 1)
@@ -147,9 +147,9 @@ def judge_loops(videos: Videos, relative: RelativeRotations, threads: int = 1) -
         angles, tolerances = _compare(videos, averaged, relative.subset(loops))
         finite = np.isfinite(angles)
         loops, angles, tolerances = loops[finite], angles[finite], tolerances[finite]
-        found = _judge_visits(videos, relative.subset(loops), angles, tolerances)
-        visits += found[0]
-        refused.append(loops[found[1]])
+        verdict = _judge_visits(videos, relative.subset(loops), angles, tolerances)
+        visits += verdict[0]
+        refused.append(loops[verdict[1]])
     return Loops(tuple(visits), np.sort(np.concatenate(refused)))
 
 

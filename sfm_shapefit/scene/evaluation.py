@@ -285,7 +285,6 @@ def evaluate_poses(
 
 
 def _without(names: Sequence[str], places: IntArray) -> tuple[str, ...]:
-    """Return the names but for those at some places."""
     known = set(places.tolist())
     return tuple(name for place, name in enumerate(names) if place not in known)
 
@@ -372,18 +371,19 @@ def _relative_pose_aucs(
 
 
 def _warnings(degenerate: bool, close: BoolArray, cap: float, turned_deg: FloatArray) -> tuple[str, ...]:
-    """Return the sentences that a reader of the figures must know."""
-    found = [few] if (few := _say_few(len(close))) else []
+    sentences = [few] if (few := _say_few(len(close))) else []
     if (turn := float(np.median(turned_deg))) > _OTHER_SCENE_DEG:
-        found.append(f"rotations differ by {turn:.0f} degrees, median: do both models show the same scene?")
+        sentences.append(
+            f"rotations differ by {turn:.0f} degrees, median: do both models show the same scene?"
+        )
     if degenerate:
-        found.append(_ON_A_LINE)
+        sentences.append(_ON_A_LINE)
     if 2 * int(close.sum()) <= len(close):
-        found.append(
+        sentences.append(
             f"only {int(close.sum())} of {len(close)} common cameras lie within {cap:.3g} of the reference;"
             " the alignment may rest on the wrong ones"
         )
-    return tuple(found)
+    return tuple(sentences)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

@@ -145,9 +145,9 @@ class Gravity(NamedTuple):
         turned = np.einsum("kba,kb->ka", sensor_rotations[self.indices], self.directions)
         frames = frame_of_image[self.indices]
         order = np.lexsort((self.sigmas, frames))
-        found, first = np.unique(frames[order], return_index=True)
+        frames_seen, first = np.unique(frames[order], return_index=True)
         rows = order[first]
-        return Gravity(found, turned[rows], self.sigmas[rows])
+        return Gravity(frames_seen, turned[rows], self.sigmas[rows])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -160,8 +160,8 @@ class Known:
 
     def of(self, images: IntArray) -> "Known":
         """Return what is told of some images (n,), ascending, numbered by their place among these."""
-        told = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Known(**{name: None if one is None else one.of(images) for name, one in told.items()})
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Known(**{name: None if one is None else one.of(images) for name, one in columns.items()})
 
 
 NOTHING_KNOWN = Known()

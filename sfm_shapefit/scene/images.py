@@ -215,9 +215,9 @@ class Images:
 
     def transformed(self, motion: Similarity, fixed: BoolArray) -> "Images":
         """Return the images after a similarity of the world, with their sensors; `fixed` frames (f,) stay."""
-        own = self.frames
-        rotations = np.where(fixed[:, None, None], own.rotations, own.rotations @ motion.rotation.T)
-        centers = np.where(fixed[:, None], own.centers, motion.apply(own.centers))
+        frames = self.frames
+        rotations = np.where(fixed[:, None, None], frames.rotations, frames.rotations @ motion.rotation.T)
+        centers = np.where(fixed[:, None], frames.centers, motion.apply(frames.centers))
         sensors = self.sensors
         return self.posed(rotations, centers).with_sensors(
             sensors.rotations, motion.scale * sensors.translations

@@ -227,17 +227,17 @@ class Lens:
 
     def with_values(self, values: FloatArray) -> "Lens":
         """Return the lens of this model that has other values, (8,)."""
-        own = values[self.own_values()].tolist()
-        return replace(self, parameters=(*own, *self.parameters[len(own) :]))
+        parameters = values[self.own_values()].tolist()
+        return replace(self, parameters=(*parameters, *self.parameters[len(parameters) :]))
 
     def own_values(self) -> BoolArray:
         """Return which of the values the model states by itself, (8,): fy is none where it is fx."""
-        own = np.zeros(NUM_VALUES, np.bool_)
+        chosen = np.zeros(NUM_VALUES, np.bool_)
         if self.is_adjustable:
             _, num_focal, num_coefficients = _LENS_MODELS[self.model]
-            own[: 4 + num_coefficients] = True
-            own[1] = num_focal == 2
-        return own
+            chosen[: 4 + num_coefficients] = True
+            chosen[1] = num_focal == 2
+        return chosen
 
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """Return x/z and y/z (m, 2) of the rays of pixels (m, 2), by Newton's method; NaN where it fails.
@@ -248,11 +248,11 @@ class Lens:
         distorted: FloatArray = (pixels - [cx, cy]) / [fx, fy]
         if not any(distortion):
             return distorted
-        found = np.empty_like(distorted)
-        for first in range(0, len(found), _PIXELS_A_SLICE):
+        points = np.empty_like(distorted)
+        for first in range(0, len(points), _PIXELS_A_SLICE):
             part = slice(first, first + _PIXELS_A_SLICE)
-            found[part] = _undistort(distorted[part].T, *distortion).T
-        return found
+            points[part] = _undistort(distorted[part].T, *distortion).T
+        return points
 
     def rays(self, pixels: FloatArray) -> FloatArray:
         """Return the unit rays (m, 3) of pixels (m, 2); NaN for those that have none."""
@@ -281,9 +281,9 @@ class Lens:
         slots, moves = np.full(NUM_VALUES, -1), np.zeros(NUM_VALUES, np.bool_)
         for part, is_free in zip(PARTS.values(), free & ~np.array(self.fixed), strict=True):
             moves[part.places] = is_free
-        own = self.own_values()
-        slots[own & moves] = np.arange(np.sum(own & moves))
-        if not own[1]:
+        chosen = self.own_values()
+        slots[chosen & moves] = np.arange(np.sum(chosen & moves))
+        if not chosen[1]:
             slots[1] = slots[0]
         return slots
 
@@ -322,7 +322,6 @@ class Lens:
         return sound and sigma <= LARGEST_SIGMA and (better or contradicts)
 
     def _is_sound(self) -> bool:
-        """Return whether the distortion is one that lenses have."""
         if self.is_plane:
             return bool(np.abs(self.values()[_DISTORTION]).max() <= _MOST_DISTORTION)
         row = self.row()

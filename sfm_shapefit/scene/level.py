@@ -79,11 +79,15 @@ def _upward(direction: FloatArray, rotations: FloatArray) -> FloatArray:
 
 def _weigh(rotations: FloatArray, up: FloatArray, normal: FloatArray | None) -> Up:
     """Return the direction up near a first one, from all that is known."""
-    own = rotations[:, :2]
-    fixed = _about(-own[:, 1].sum(axis=0), _TILT)
+    horizontal = rotations[:, :2]
+    fixed = _about(-horizontal[:, 1].sum(axis=0), _TILT)
     fixed += 0.0 if normal is None else _about(normal, _GROUND)
     for _ in range(_ROUNDS):
-        axes = np.where((np.abs(own[:, 0] @ up) <= np.abs(own[:, 1] @ up))[:, None], own[:, 0], own[:, 1])
+        axes = np.where(
+            (np.abs(horizontal[:, 0] @ up) <= np.abs(horizontal[:, 1] @ up))[:, None],
+            horizontal[:, 0],
+            horizontal[:, 1],
+        )
         rolls = np.arcsin(np.clip(axes @ up, -1.0, 1.0))
         sigma = max(SIGMA_PER_MEDIAN * float(np.median(np.abs(rolls))), _LEAST_ROLL)
         weights = 1.0 / (1.0 + (rolls / (3.0 * sigma)) ** 2) ** 2

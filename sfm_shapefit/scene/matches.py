@@ -71,7 +71,6 @@ class RayMatches(Lists):
         return self._taken(offsets, np.repeat(self.offsets[:-1], taken) + steps)
 
     def _taken(self, offsets: IntArray, rows: IntArray) -> "RayMatches":
-        """Return the pairs with other matches, by rows."""
         return RayMatches(
             pairs=self.pairs,
             offsets=offsets,
@@ -299,7 +298,6 @@ class View:
         return self._consumed(found)
 
     def _consumed(self, links: Iterator[KeypointMatches]) -> Iterator[KeypointMatches]:
-        """Yield the last matches of these for a while."""
         yield from links
         self.give_back()  # rays too, by which those without one are told
 
@@ -330,7 +328,6 @@ class View:
         advance(self.num_pairs, self.num_pairs)
 
     def _batches(self, chosen: IntArray, min_matches: int) -> Iterator[MatchBatch]:
-        """Yield the matches of chosen pairs with their rays."""
         for found in self._links(chosen, min_matches):
             self._keep_rays(np.unique(found.pairs))
             rows = np.repeat(self._begins[found.pairs], np.diff(found.offsets), axis=0) + found.keypoints
@@ -351,7 +348,6 @@ class View:
                 yield batch
 
     def _keypoint_batch(self, chosen: IntArray, min_matches: int) -> KeypointMatches:
-        """Return the matches of some of the chosen pairs."""
         pairs = self.pairs[chosen]
         all_see = all(self._blind_of(image) is None for image in np.unique(pairs).tolist())
         counts, keypoints = self.matches.read(self.rows[chosen], keep=self.reading.keeps)
@@ -400,7 +396,6 @@ class View:
             self.matches.forget()
 
     def _forget_rays(self) -> None:
-        """Give back the memory of the rays of keypoints."""
         self._rays, self._num_rays = np.empty((0, 3)), 0
         self._begins = np.full(self.images.num_images, -1)
 
@@ -422,11 +417,11 @@ def is_among(pairs: IntArray, others: IntArray) -> BoolArray:
 def rows_of_pairs(pairs: IntArray, others: IntArray) -> IntArray:
     """Return the row of each pair (k, 2) among others (m, 2), -1 for none, whatever the order of images."""
     size = 1 + max(int(pairs.max(initial=0)), int(others.max(initial=0)))
-    own, those = (np.sort(ends, axis=1) @ np.array([size, 1]) for ends in (pairs, others))
+    keys, those = (np.sort(ends, axis=1) @ np.array([size, 1]) for ends in (pairs, others))
     those = np.append(those, -1)  # which is none
     order = np.argsort(those, kind="stable")
-    rows = order[np.minimum(np.searchsorted(those, own, sorter=order), len(those) - 1)]
-    return np.asarray(np.where(those[rows] == own, rows, -1))
+    rows = order[np.minimum(np.searchsorted(those, keys, sorter=order), len(those) - 1)]
+    return np.asarray(np.where(those[rows] == keys, rows, -1))
 
 
 def indices_of_pairs(index: Mapping[str, int], pairs: PairNames) -> IntArray:

@@ -74,14 +74,16 @@ class Points(Lists):
         begins = np.append(0, np.cumsum(num_keypoints))
         point_of = np.full(begins[-1], -1)
         point_of[begins[self.images] + self.keypoints] = self.points_seen()
-        found = [np.zeros((0, 3), dtype=np.int64)]
+        observations = [np.zeros((0, 3), dtype=np.int64)]
         for batch in links:
             ends = np.repeat(batch.pairs, np.diff(batch.offsets), axis=0)
-            for own in (0, 1):
-                points = point_of[begins[ends[:, 1 - own]] + batch.keypoints[:, 1 - own]]
-                rows = np.flatnonzero(others[ends[:, own]] & (points >= 0))
-                found.append(np.column_stack([points[rows], ends[rows, own], batch.keypoints[rows, own]]))
-        new = np.concatenate(found)
+            for end in (0, 1):
+                points = point_of[begins[ends[:, 1 - end]] + batch.keypoints[:, 1 - end]]
+                rows = np.flatnonzero(others[ends[:, end]] & (points >= 0))
+                observations.append(
+                    np.column_stack([points[rows], ends[rows, end], batch.keypoints[rows, end]])
+                )
+        new = np.concatenate(observations)
         if least > 1:
             new, counts = np.unique(new, axis=0, return_counts=True)
             new = new[counts >= least]

@@ -118,9 +118,9 @@ def trajectory_errors(model: NamedPoses, reference: NamedPoses) -> TrajectoryErr
     moved = NamedPoses(model.names, model.rotations @ onto.rotation.T, onto.apply(model.centers))
     turns, shifts = [], []
     for poses in (moved, reference):
-        before, after = poses.rotations[:-1], poses.rotations[1:]
-        turns.append(before @ _transposed(after))
-        shifts.append(np.einsum("kab,kb->ka", before, np.diff(poses.centers, axis=0)))
+        earlier, after = poses.rotations[:-1], poses.rotations[1:]
+        turns.append(earlier @ _transposed(after))
+        shifts.append(np.einsum("kab,kb->ka", earlier, np.diff(poses.centers, axis=0)))
     return TrajectoryErrors(
         ate=summarize_errors(np.linalg.norm(moved.centers - reference.centers, axis=1)),
         rpe=summarize_errors(np.linalg.norm(shifts[0] - shifts[1], axis=1)),

@@ -52,30 +52,30 @@ def same_images(names: Sequence[str], others: Sequence[str]) -> SameImages:
 def names_among(names: Iterable[str], others: Sequence[str]) -> tuple[dict[str, str], str]:
     """Return what each of some names is called among others, as far as it is there; and `ambiguity`."""
     listed = list(names)
-    found = same_images(listed, others)
-    places = zip(listed, found.places.tolist(), strict=True)
-    return {name: others[place] for name, place in places if place >= 0}, found.ambiguity
+    matched = same_images(listed, others)
+    places = zip(listed, matched.places.tolist(), strict=True)
+    return {name: others[place] for name, place in places if place >= 0}, matched.ambiguity
 
 
 def _match(places: IntArray, names: Sequence[str], others: Sequence[str], rule: Callable[[str], str]) -> str:
     """Fill in the places of names that are one image alone by a rule; return a clause about the rest."""
-    ours, theirs = (_grouped(map(rule, own)) for own in (names, others))
+    ours, theirs = (_grouped(map(rule, images)) for images in (names, others))
     chosen, chosen_back = _choices(ours, theirs), _choices(theirs, ours)
     taken, unclear = set(places.tolist()), []
-    for key, own in ours.items():
+    for key, images in ours.items():
         mutual = [one for one in chosen[key] if key in chosen_back[one]]
         found = [place for one in mutual for place in theirs[one]]
-        if taken.issuperset(found) or (places[own] >= 0).all():
+        if taken.issuperset(found) or (places[images] >= 0).all():
             continue
         rivals = chosen_back[mutual[0]]
-        if len(own) == len(found) == len(rivals) == 1:
-            places[own] = found
+        if len(images) == len(found) == len(rivals) == 1:
+            places[images] = found
         else:
             unclear.append((rivals, mutual))
     if not unclear:
         return ""
     sides = zip(unclear[0], (ours, theirs), (names, others), strict=True)
-    said = (sorted(own[k] for key in keys for k in places_of[key]) for keys, places_of, own in sides)
+    said = (sorted(images[k] for key in keys for k in places_of[key]) for keys, places_of, images in sides)
     more = f" (and {len(unclear) - 1} more)" if len(unclear) > 1 else ""
     return f"{' may be '.join(' or '.join(some[:_MOST_SAID]) for some in said)}{more}; give whole names"
 
@@ -110,7 +110,6 @@ def _first_tail(name: str, names: Collection[str]) -> str | None:
 
 
 def _grouped(keys: Iterable[str]) -> dict[str, list[int]]:
-    """Return the places of each key."""
     places: dict[str, list[int]] = {}
     for place, key in enumerate(keys):
         places.setdefault(key, []).append(place)

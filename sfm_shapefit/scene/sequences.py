@@ -29,9 +29,9 @@ def find_sequences(names: Sequence[str]) -> list[tuple[IntArray, IntArray]]:
         digits = "".join(_DIGITS.findall(stem))
         if dot and digits:
             alike[folder, _DIGITS.sub("#", stem)].append((int(digits[-_MOST_DIGITS:]), row))
-    found = []
+    sequences = []
     for members in alike.values():
         numbers, rows = np.array(sorted(members), dtype=np.int64).T
         if np.ptp(numbers) <= max(_SPARSEST * len(rows), _NARROW * numbers[-1]):
-            found.append((rows, numbers))
-    return found
+            sequences.append((rows, numbers))
+    return sequences

@@ -65,8 +65,8 @@ from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor, pr
 _ROUNDS = 8
 # A round shrinks the equality residual to this share; exact solves would gain no round.
 _ROUND_REDUCTION = 0.1
-# The rounds end when the excess costs less than this share of the gap; the second share is that where the gap
-# misses what was asked for in any case.
+# Share of the gap; the rounds end when the excess costs less. The second share holds where the gap misses the
+# tolerance whatever the rounds do.
 _NEGLIGIBLE, _NEGLIGIBLE_MISSED = 0.03, 0.3
 # Least residual that the metric takes seriously, relative to the mean one; exact pairs have none.
 _RESIDUAL_FLOOR = 0.1

@@ -11,6 +11,7 @@ from sfm_shapefit.base.threads import MAX_THREADS, count_threads
 
 if TYPE_CHECKING:  # numpy is not cheap
     from sfm_shapefit.base.arrays import FloatArray
+    from sfm_shapefit.base.executors import Advance
 
 Solver = Literal["auto", "newton", "admm", "conic"]
 
@@ -54,6 +55,11 @@ OnIteration = Callable[[IterationInfo], bool | None]
 """Called after each iteration; returning False, or raising, cancels the solve."""
 
 
+def reported(advance: "Advance") -> OnIteration:
+    """Return a callback that reports each iteration: of at most so many, for fewer may do."""
+    return lambda info: advance(info.iteration, max(info.limit, info.iteration))
+
+
 def asks_to_stop(on_iteration: OnIteration | None, info: IterationInfo) -> bool:
     """Tell the callback, if any, of an iteration; return whether it cancels, as a numpy False does."""
     answer = None if on_iteration is None else on_iteration(info)
@@ -91,8 +97,8 @@ class SolverOptions(Settings):
     )
     tol: float = option(
         1e-8,
-        "Certified gap, objective - dual_bound, at which a solve counts as converged. Left as it is, it is "
-        "1e-6 for a placement of more than a million pairs.",
+        "Certified gap, objective - dual_bound, at which a solve counts as converged. Placements of more "
+        "than a million pairs take 1e-6 unless another value is given.",
     )
     max_iterations: int | None = option(
         None,

@@ -240,7 +240,6 @@ def _rng(noise: Noise) -> np.random.Generator:
 
 
 def _measure(locations: FloatArray, edges: IntArray, rng: np.random.Generator, noise: Noise) -> GraphProblem:
-    """Return the directions of `edges` with noise and corruption."""
     sigma, q, corruption = noise.get("sigma", 0.0), noise.get("q", 0.0), noise.get("corruption", "uniform")
     if corruption not in get_args(CorruptionKind):
         raise ValueError(

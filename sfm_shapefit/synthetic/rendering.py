@@ -163,8 +163,6 @@ def _undistort(scene: RenderedScene, xy: FloatArray) -> FloatArray:
 
 
 class _Triangles(NamedTuple):
-    """The triangles that turn their outside to a camera."""
-
     rows: IntArray
     """(k,) in the surfaces."""
     corners: FloatArray
@@ -174,7 +172,6 @@ class _Triangles(NamedTuple):
 
 
 def _facing_triangles(scene: RenderedScene, image: int) -> _Triangles:
-    """Return the triangles that may be seen."""
     in_camera = (scene.surfaces.corners - scene.centers[image]) @ scene.rotations[image].T
     v = np.ascontiguousarray(in_camera.swapaxes(1, 2))
     volume = np.linalg.det(v)

@@ -296,17 +296,17 @@ def _false_lists(
     rng: np.random.Generator,
 ) -> dict[int, _FalseList]:
     """Return the false list of each corrupted pair, by pair index; a random fraction of all pairs."""
-    asked = round(options.corrupted_pair_fraction * len(pairs))
+    number = round(options.corrupted_pair_fraction * len(pairs))
     false_lists: dict[int, _FalseList] = {}
     for e in rng.permutation(len(pairs)):
-        if len(false_lists) == asked:
+        if len(false_lists) == number:
             break
         false = _false_list(layout, keypoint_points, pairs[e], options, rng)
         if false is not None:
             false_lists[int(e)] = false
-    if len(false_lists) < asked:
+    if len(false_lists) < number:
         raise InputError(
-            f"only {len(false_lists)} of the {asked} pairs to corrupt have a false baseline that keeps"
+            f"only {len(false_lists)} of the {number} pairs to corrupt have a false baseline that keeps"
             f" {options.min_matches} points in view; lower corrupted_pair_fraction or raise num_points"
         )
     return false_lists

@@ -50,8 +50,6 @@ class Surfaces:
 
 
 class _Part(NamedTuple):
-    """A mesh with its picture."""
-
     corners: FloatArray
     texels: FloatArray
     normals: FloatArray
@@ -196,8 +194,8 @@ def _house_maker(
 
     def house(place: _Place) -> list[_Part]:
         picture, low, extent = repeating if next(repeats) else drawn()
-        before = low - extent * [0.0, 1.0, 0.0]  # balconies stand out of the front
-        balconies = [_box(place, a, a + e, picture) for a, e in zip(before, extent, strict=True)]
+        front = low - extent * [0.0, 1.0, 0.0]  # balconies stand out of the front
+        balconies = [_box(place, a, a + e, picture) for a, e in zip(front, extent, strict=True)]
         return [_box(place, np.zeros(3), np.array([width, _HOUSE_DEPTH_M, height_m]), picture), *balconies]
 
     return house

@@ -76,7 +76,6 @@ def _points(scene: Scene) -> Points:
 
 
 def _camera(scene: Scene) -> pycolmap.Camera:
-    """Return the camera of a scene."""
     k = scene.calibration
     return models.new_camera(scene, "PINHOLE", [k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
 

@@ -11,7 +11,7 @@ from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.intrinsics import calibrate_view_graph, find_uncalibrated
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.pipeline.inputs import settle_intrinsics
+from sfm_shapefit.pipeline.inputs import choose_intrinsics
 from sfm_shapefit.scene.lens import FOCAL, Origin
 from tests.scenes import RING, copied, edit_database, fingerprint, read_from
 
@@ -28,7 +28,7 @@ def database_with(folder, model, params, prior):
 def settled(path, images, wanted, **how):
     """Return what is started from, and what may change, by the matches of a database."""
     with closing(open_database(path, images.names)) as matches:
-        return settle_intrinsics(images, matches, wanted, **how)
+        return choose_intrinsics(images, matches, wanted, **how)
 
 
 @pytest.mark.parametrize(

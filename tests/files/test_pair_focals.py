@@ -83,6 +83,6 @@ def test_they_outweigh_the_view_graph_where_they_differ_from_it_by_more_than_the
     )
     given = read_from(scene[0], read_images).images
     with closing(open_database(scene[0], given.names)) as matches:
-        images, _ = inputs.settle_intrinsics(given, matches, "auto")
+        images, _ = inputs.choose_intrinsics(given, matches, "auto")
     found = [lens.focal_px for lens in images.lenses if lens.id in GUESSED]
     assert found == pytest.approx([500.0, 510.0, 500.0])

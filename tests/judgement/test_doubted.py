@@ -8,6 +8,7 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
@@ -19,7 +20,6 @@ from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline import doubts as doubts_stage
 from sfm_shapefit.pipeline import locate as locating
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs
 from sfm_shapefit.pipeline.inputs import inputs_from, see_matches
 from sfm_shapefit.pipeline.measure import measure

@@ -14,11 +14,10 @@ from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.judgement.support import ObservationShares, Support
 from sfm_shapefit.pairs.pair_directions import PairDirections
-from sfm_shapefit.pipeline.gauge_choice import choose_frame
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, choose_inputs, open_source
-from sfm_shapefit.pipeline.measure import Measured
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement, place_pieces
@@ -80,9 +79,9 @@ def state_at(source, locations, *, options=None, all_pairs=True, pull_rad=None, 
         known=Known(priors=told.pop("priors", None)),
         **{"scale": "auto", **told},
     )
-    measured, placement = Measured(directions=directions_of(images, pairs)), placement_at(locations, pairs)
+    measured = MeasuredPairs(directions=directions_of(images, pairs))
     state = ModelState.of(inputs, source)
-    return choose_frame(replace(state, measured=measured, placement=placement))
+    return replace(state, measured=measured, placement=placement_at(locations, pairs)).framed()
 
 
 def delivered(source) -> ModelState:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.mapping import ComponentAveraging, PairScores
+from sfm_shapefit.pipeline.components import ComponentAveraging, PairScores
 from sfm_shapefit.rotations.options import AveragingOptions
 from tests.problems import made_rotations
 

@@ -11,7 +11,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.files.colmap.control_points import read_control_points
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.pipeline.gauge_choice import read_known
+from sfm_shapefit.pipeline.known import read_known
 from sfm_shapefit.placement.control_points import control_gauge, fit_control_points
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.scene.given import ControlPoints

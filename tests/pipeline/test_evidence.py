@@ -9,17 +9,16 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pipeline import evidence
+from sfm_shapefit.pipeline import examination as evidence
 from sfm_shapefit.pipeline.check import check
-from sfm_shapefit.pipeline.checked import check_source
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import inputs_from, open_source
+from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
-from sfm_shapefit.solver.options import SolverOptions
 from tests.models import by_name, write_priors
 from tests.scenes import COURTYARD, RING, copied, edit_database
 
@@ -188,7 +187,7 @@ def test_points_are_lost_that_only_a_pair_carries_whose_matches_mostly_see_two_p
 def test_halves_that_a_join_ties_are_not_doubted(halves):
     model = read_model(halves.models[0].located.reconstruction)
     joined = np.flatnonzero(np.isin(model.images.ids, [1, 2, 13, 14]))
-    clock = Clock.of(None, SolverOptions())
+    clock = Clock.of(None)
     with open_source(model, inputs_from(halves.database)) as source:
         tied = replace(source, tied=np.array([*combinations(joined.tolist(), 2)]))
         told = [check_source(model, one, DirectionOptions(), clock).facts.evidence for one in (source, tied)]

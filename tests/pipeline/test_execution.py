@@ -11,13 +11,13 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import concatenate
 from sfm_shapefit.pipeline import execution
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import (
     WorkerError,
     measure_part,

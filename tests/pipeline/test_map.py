@@ -12,14 +12,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.scene import describe_line, describe_loops
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.pair_list import read_pair_list
-from sfm_shapefit.pipeline import evidence, relative_rotations
-from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline import examination as evidence
+from sfm_shapefit.pipeline import relative_rotations
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.pipeline.starts import adjust_first_placement
 from sfm_shapefit.report.drawing import PairClass

@@ -2,25 +2,25 @@
 
 import re
 from dataclasses import fields, replace
-from functools import partial
 
 import numpy as np
 import pytest
 
 import sfm_shapefit
 from sfm_shapefit import InputError
+from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.measure import add_evidence
 from sfm_shapefit.pipeline.memory import (
-    ECONOMIES,
     Workload,
-    choose_economy,
+    choose_memory_plan,
     describe_work,
     forecast,
     keep_within_memory,
 )
+from sfm_shapefit.placement.memory_plan import MEMORY_PLANS
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.options import NO_FACTOR
 from sfm_shapefit.synthetic import random_graph_problem
@@ -43,7 +43,7 @@ BARE = replace(WORK, num_edges=100_000, num_nodes=1000, has_points=False, factor
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Workload) if field.name != "needs_factor"])
 def test_neither_a_cheaper_economy_nor_less_work_needs_more_memory(name):
-    peaks = [forecast(WORK, economy).peak_mb for economy in ECONOMIES]
+    peaks = [forecast(WORK, economy).peak_mb for economy in MEMORY_PLANS]
     assert peaks == sorted(peaks, reverse=True)
     assert peaks[0] > 2.0 * peaks[-1]
     more = replace(
@@ -54,21 +54,21 @@ def test_neither_a_cheaper_economy_nor_less_work_needs_more_memory(name):
             )
         },
     )
-    for economy, peak in zip(ECONOMIES, peaks, strict=True):
+    for economy, peak in zip(MEMORY_PLANS, peaks, strict=True):
         assert forecast(more, economy).peak_mb >= peak
 
 
 def test_the_cheapest_economy_that_fits_is_taken_or_the_number_that_is_enough_is_told():
-    for k, economy in enumerate(ECONOMIES):
+    for k, economy in enumerate(MEMORY_PLANS):
         limit = forecast(WORK if economy.points else BARE, economy).peak_mb
-        chosen = choose_economy(WORK, BARE, limit)
-        assert ECONOMIES.index(chosen) <= k
+        chosen = choose_memory_plan(WORK, BARE, limit)
+        assert MEMORY_PLANS.index(chosen) <= k
         assert forecast(WORK if chosen.points else BARE, chosen).peak_mb <= limit
-    assert choose_economy(WORK, BARE, np.inf, ECONOMIES[2]) is ECONOMIES[2]  # given up already
+    assert choose_memory_plan(WORK, BARE, np.inf, MEMORY_PLANS[2]) is MEMORY_PLANS[2]  # given up already
     with pytest.raises(InputError, match="raise it to") as refused:
-        choose_economy(WORK, BARE, 100.0)
+        choose_memory_plan(WORK, BARE, 100.0)
     needed = float(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
-    assert choose_economy(WORK, BARE, needed) is ECONOMIES[-1]
+    assert choose_memory_plan(WORK, BARE, needed) is MEMORY_PLANS[-1]
 
 
 def loop_graph(num_nodes=400):
@@ -89,6 +89,11 @@ LOOP_WORK = Workload(
 )
 
 
+def limited_to(limit_mb, **options):
+    """Options with a limit of memory."""
+    return LocateOptions(max_memory_mb=int(limit_mb), **options)
+
+
 def describe(measured, work, options=PLACEMENT):
     """What there is to do with a graph."""
     return describe_work(measured, work, options)
@@ -101,20 +106,20 @@ def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it_and_then_n
     for measured, options in ((plain, newton), (grouped, split), (grouped, newton)):
         work = describe(measured, LOOP_WORK, options)
         assert work.needs_factor
-        peaks = [forecast(work, economy).peak_mb for economy in ECONOMIES[-2:]]
+        peaks = [forecast(work, economy).peak_mb for economy in MEMORY_PLANS[-2:]]
         assert peaks[0] == peaks[1]  # so that it is never chosen
     full = describe(plain, LOOP_WORK, split)
     assert full.factor_entries > 0
     assert not full.needs_factor
-    least = forecast(full, ECONOMIES[-1]).peak_mb
-    assert forecast(full, ECONOMIES[-2]).peak_mb > least
-    of_split = partial(describe, work=LOOP_WORK, options=split)
-    economy, kept = keep_within_memory(plain, of_split, int(np.ceil(least)), ECONOMIES[0])
-    assert economy is ECONOMIES[-1]
+    least = forecast(full, MEMORY_PLANS[-1]).peak_mb
+    assert forecast(full, MEMORY_PLANS[-2]).peak_mb > least
+    limited = limited_to(np.ceil(least), solver="admm")
+    economy, kept = keep_within_memory(plain, LOOP_WORK, limited, MEMORY_PLANS[0])
+    assert economy is MEMORY_PLANS[-1]
     assert kept is plain
     changed = economy.limit(split)
     assert changed == PlacementOptions(solver="admm", factor_memory_mb=NO_FACTOR, refine=False)
-    assert ECONOMIES[-2].limit(split) is split
+    assert MEMORY_PLANS[-2].limit(split) is split
     assert "neither refined" in economy.statement
 
 
@@ -131,33 +136,30 @@ def test_points_that_are_given_up_are_in_the_graph_no_more():
         num_nodes=140,
         adjusts=True,
     )
-    limit = forecast(describe(measured.without_points(), work), ECONOMIES[3]).peak_mb
-    economy, kept = keep_within_memory(
-        measured, partial(describe, work=work), int(np.ceil(limit)), ECONOMIES[0]
-    )
+    limit = forecast(describe(measured.without_points(), work), MEMORY_PLANS[3]).peak_mb
+    economy, kept = keep_within_memory(measured, work, limited_to(np.ceil(limit)), MEMORY_PLANS[0])
     assert not economy.points
     assert kept.num_points == 0
-    assert keep_within_memory(measured, partial(describe, work=work), 0, ECONOMIES[0])[1] is measured
+    assert keep_within_memory(measured, work, limited_to(0), MEMORY_PLANS[0])[1] is measured
 
 
 def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_for():
     crowded = replace(WORK, num_matches=20_000_000, num_keypoints=20_000_000)
-    peaks = {economy.adjustment: forecast(crowded, economy).peak_mb for economy in ECONOMIES}
+    peaks = {economy.adjustment: forecast(crowded, economy).peak_mb for economy in MEMORY_PLANS}
     assert set(forecast(crowded).memory_mb) - set(forecast(replace(crowded, adjusts=False)).memory_mb) == {
         "adjusting"
     }
     # Each of 14 million observations has an entry of 144 bytes at least, among much else.
     assert peaks[True] > peaks[False] + 14 * 144
     asked = replace(crowded, adjusts_bundle=True)
-    assert forecast(asked, ECONOMIES[-1]).peak_mb > 14 * 144
+    assert forecast(asked, MEMORY_PLANS[-1]).peak_mb > 14 * 144
     measured = MeasuredGraph(loop_graph())
-    last = [economy for economy in ECONOMIES if economy.adjustment][-1]
-    of_crowded = partial(describe, work=crowded)
-    needed = forecast(of_crowded(measured), last).peak_mb
-    economy = keep_within_memory(measured, of_crowded, int(needed) - 1, ECONOMIES[0])[0]
+    last = [economy for economy in MEMORY_PLANS if economy.adjustment][-1]
+    needed = forecast(describe(measured, crowded), last).peak_mb
+    economy = keep_within_memory(measured, crowded, limited_to(needed - 1), MEMORY_PLANS[0])[0]
     assert "not adjusted" in economy.statement
     assert not economy.adjustment
-    assert keep_within_memory(measured, of_crowded, 10**6, ECONOMIES[0])[0].adjustment
+    assert keep_within_memory(measured, crowded, limited_to(10**6), MEMORY_PLANS[0])[0].adjustment
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +193,7 @@ def test_what_is_given_up_is_what_the_warning_says(workspaces, kind, monkeypatch
         sampled.append(measured.errors)
         return add_evidence(graph, measured)
 
-    monkeypatch.setattr("sfm_shapefit.pipeline.rigs.add_evidence", listen)
+    monkeypatch.setattr("sfm_shapefit.pipeline.placing.add_evidence", listen)
     full = sfm_shapefit.inspect(workspaces[kind]).expected
     for limit in range(int(full.peak_mb) - 1, 200, -5):
         try:

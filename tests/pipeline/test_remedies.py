@@ -9,7 +9,6 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.places import OtherPlace
@@ -71,10 +70,10 @@ def test_a_camera_goes_where_twice_as_many_pairs_put_it(ring_located, here, move
     place = OtherPlace(2, here, 6, np.ones(3), pairs)
     found = replace(ring_located, evidence=ModelEvidence(places=(place,)))
     model = read_model(RING / "sparse" / "0")
-    inputs, options = choose_inputs(RING / "sparse" / "0", DATABASE), LocateOptions()
+    inputs = choose_inputs(RING / "sparse" / "0", DATABASE)
     opened, inputs = open_matches(model, inputs)
     with closing(opened) as matches:
-        source = see_matches(matches, model.images, inputs, options)
+        source = see_matches(matches, model.images, inputs)
         remedies = list(find_remedies(found, inputs_of(found), source))
         assert len(remedies) == moves
         for remedy in remedies:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit import InputError, LocateOptions, UnsolvableError
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.geometry import fit_similarity, rotation_angles_deg
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
@@ -21,17 +22,17 @@ from sfm_shapefit.files.colmap.listed_poses import read_list
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import template_of
-from sfm_shapefit.pipeline import adjustment as adjustment_stage
+from sfm_shapefit.pipeline import camera_adjustment as adjustment_stage
 from sfm_shapefit.pipeline import doubts as doubts_stage
 from sfm_shapefit.pipeline import measure as measure_stage
-from sfm_shapefit.pipeline import rigs as rigs_stage
-from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline import placing as rigs_stage
 from sfm_shapefit.pipeline.convert import convert
-from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.join import judge_joins
+from sfm_shapefit.pipeline.model_joins import judge_joins
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.write import write_result
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
+from sfm_shapefit.placement.gauge_rule import GaugeRule
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.synthetic import (
@@ -193,7 +194,7 @@ def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace
     images, every = read_model(workspace / "truth").images, np.arange(36)
     apart = float(np.linalg.norm(images.centers[0] - images.centers[20]))
     distances = ((images.names[0], images.names[20], 2.0 * apart),)
-    rigid = rigs_stage.find_rigid_parts(images, every < 0)
+    rigid = find_fixed_and_rigged(images, every < 0)
     rule = GaugeRule(images, rigid, "unit", made_priors(3.0 * images.centers), distances)
     chosen = rule.choose(every, 0.1 * images.centers, 0.1)
     assert chosen.scale == "rig"

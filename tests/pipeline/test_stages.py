@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit import LocateOptions
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import (
     angle_between_deg,
@@ -16,23 +17,24 @@ from sfm_shapefit.base.geometry import (
     mean_rotation_l1,
     normalized,
     rotation_angles_deg,
+    turned_deg,
 )
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_of_rotations, turned_deg
-from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.camera_adjustment import adjust_placed
 from sfm_shapefit.pipeline.doubts import doubt_cameras
 from sfm_shapefit.pipeline.finish import finish_model
-from sfm_shapefit.pipeline.gauge_choice import GaugeRule, gauge_rule
-from sfm_shapefit.pipeline.join import judge_joins, merge_groups
-from sfm_shapefit.pipeline.measure import Measured, Wanted, add_evidence, build_graph, measure
+from sfm_shapefit.pipeline.known import pull_of_rotations
+from sfm_shapefit.pipeline.measure import MeasureRequest, add_evidence, build_graph, measure
+from sfm_shapefit.pipeline.model_joins import judge_joins, merge_groups
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
-from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
+from sfm_shapefit.pipeline.placing import place_cameras
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
 from sfm_shapefit.pipeline.stages import (
     adjust_cameras,
@@ -43,9 +45,12 @@ from sfm_shapefit.pipeline.stages import (
     seed_model,
     set_gauge,
 )
+from sfm_shapefit.pipeline.starts import begin_model
 from sfm_shapefit.pipeline.state import ModelState
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
+from sfm_shapefit.placement.gauge_rule import GaugeRule
 from sfm_shapefit.placement.move import move_cameras
-from sfm_shapefit.placement.place import Near
+from sfm_shapefit.placement.place import InitialPlacement
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.tracks.options import NodeOptions
 from tests.models import centers_of, only, posed
@@ -69,7 +74,7 @@ def relative_rotations(model, turned=()):
 
 def test_measure_tells_directions_tracks_and_errors_of_one_pass_and_makes_a_graph_of_them():
     with opened() as source:
-        found = measure(source, DirectionOptions(), Clock(), Wanted(tracks="always", errors=True))
+        found = measure(source, DirectionOptions(), Clock(), MeasureRequest(tracks="always", errors=True))
         bare = measure(source, DirectionOptions(), Clock())
     i, j = found.directions.pairs[found.directions.usable()].T
     true = normalized(TRUTH.centers[i] - TRUTH.centers[j])
@@ -91,7 +96,7 @@ def test_measure_tells_directions_tracks_and_errors_of_one_pass_and_makes_a_grap
 
 def test_many_cameras_that_pairs_of_many_directions_hold_need_no_points(monkeypatch):
     with opened() as source:
-        found = measure(source, DirectionOptions(), Clock(), Wanted(tracks="always"))
+        found = measure(source, DirectionOptions(), Clock(), MeasureRequest(tracks="always"))
     parallel = np.where(np.isfinite(found.directions.directions), [1.0, 0.0, 0.0], np.nan)
     flat = replace(found, directions=replace(found.directions, directions=parallel))
     degree = int(build_graph(TRUTH, found, NodeOptions(points="never")).graph.degrees().min())
@@ -104,15 +109,42 @@ def test_many_cameras_that_pairs_of_many_directions_hold_need_no_points(monkeypa
     monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_PAIRS", 2)
     assert [has_points(found), has_points(found, "always"), has_points(flat)] == [False, True, True]
     with opened() as source:
-        assert measure(source, DirectionOptions(), Clock(), Wanted(tracks="auto")).tracks is None
+        assert measure(source, DirectionOptions(), Clock(), MeasureRequest(tracks="auto")).tracks is None
         monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_PAIRS", degree + 6)
-        again = measure(source, DirectionOptions(), Clock(), Wanted(tracks="auto", checked=True))
+        again = measure(source, DirectionOptions(), Clock(), MeasureRequest(tracks="auto", checked=True))
     assert has_points(found)
     assert again.checks
     own, usual = again.tracks.tracks(), found.tracks.tracks()  # joined after all directions were known
     assert usual.num_tracks > 10
     np.testing.assert_array_equal(own.rays, usual.rays)
     np.testing.assert_array_equal(own.offsets, usual.offsets)
+
+
+@pytest.mark.parametrize(
+    ("known", "off_deg"),
+    [({}, 0.1), ({"is_component": True}, 0.1), ({"rough_rad": np.radians(2.0)}, 2.0)],
+    ids=["given", "averaged", "rough"],
+)
+def test_begin_takes_rotations_as_they_are_or_makes_averaged_and_rough_ones_finer(known, off_deg):
+    rng = np.random.default_rng(0)
+    errors = Rotation.from_rotvec(np.radians(off_deg) * rng.standard_normal((8, 3))).as_matrix()
+    turns = dict(zip(TRUTH.names, errors, strict=True))
+    off = posed(FOLDER, lambda name, rotation, center: (turns[name] @ rotation, center))
+    with opened(off) as source:
+        priors = made_priors(TRUTH.centers)
+        inputs = replace(state_at(source, TRUTH.centers, priors=priors, pull_rad=np.inf).inputs, **known)
+        state = begin_model(inputs, source, Clock())
+    assert state.inputs is inputs  # positions are known again after a first placement
+    assert state.warnings == ()
+    turned = TRUTH.rotations.transpose(0, 2, 1) @ state.source.images.rotations
+    left_deg = rotation_angles_deg(turned @ mean_rotation_l1(turned).T)
+    if not known:
+        assert (state.first, state.near) == (None, None)
+        assert left_deg.max() > 0.1
+        return
+    assert left_deg.max() < 0.02  # keypoints are off by 0.3 px, a fiftieth of a degree
+    placed = fit_similarity(state.near.locations, TRUTH.centers).apply(state.near.locations)
+    assert np.abs(placed - TRUTH.centers).max() < 0.01 * np.ptp(TRUTH.centers)
 
 
 def test_measured_directions_are_those_of_the_true_cameras():
@@ -129,7 +161,7 @@ def test_a_further_piece_begins_without_what_is_known_of_positions():
     with opened() as source:
         told = {"scale": "input", "priors": made_priors(TRUTH.centers)}
         known = replace(state_at(source, TRUTH.centers, **told).inputs, fixed=np.arange(8) == 4)
-        measured = Measured(directions=directions_of(TRUTH, edges))
+        measured = MeasuredPairs(directions=directions_of(TRUTH, edges))
         state = replace(ModelState.of(known, source), measured=measured)
         first, second = place_rigid_pieces(state, Clock())
     assert [one.placement.cameras.tolist() for one in (first, second)] == [[3, 4, 5, 6, 7], [0, 1, 2, 3]]
@@ -295,7 +327,7 @@ def test_judge_takes_errors_from_a_first_placement_in_the_scale_of_the_cameras_t
         first = SimpleNamespace(
             images=TRUTH.part(rows), covariances=known, lens_errors=None, scale_sigma=None
         )
-        after = judge_piece(replace(state, near=Near(before, None), first=first), Clock())
+        after = judge_piece(replace(state, near=InitialPlacement(before, None), first=first), Clock())
         bare = judge_piece(state, Clock())
     np.testing.assert_allclose(after.judged.adjusted_covariances[rows], known / 40.0**2, rtol=1e-9)
     assert np.isnan(after.judged.adjusted_covariances[5]).all()
@@ -340,7 +372,7 @@ TURNED_PRIORS = {"priors": made_priors(2.0 * (TRUTH.centers + OFF) @ TURN.T + 10
     ],
 )
 def test_gauge_the_first_by_precedence_sets_the_scale_and_the_others_check_it(fixed, told, scale, checks):
-    locations, rigid = 0.1 * TRUTH.centers, find_rigid_parts(TRUTH, np.arange(8) < fixed)
+    locations, rigid = 0.1 * TRUTH.centers, find_fixed_and_rigged(TRUTH, np.arange(8) < fixed)
     rule = GaugeRule(TRUTH, rigid, **{"scale": "auto", **told})
     chosen = rule.choose(np.arange(8), locations, 0.1 if fixed > 1 else None)
     assert chosen.scale == scale
@@ -376,7 +408,7 @@ def test_seed_has_the_scale_the_origin_and_the_axes_that_are_told_also_where_all
         found = set_gauge(seed_points(state, Clock()))
     assert (found.bundle is not None) == (adjust == "full")
     centers = found.images.centers
-    again = gauge_rule(state).choose(np.arange(8), centers, None)  # what is told holds already
+    again = state.gauge_rule.choose(np.arange(8), centers, None)  # what is told holds already
     assert again.scale == found.gauge.scale
     axes = np.eye(3) if found.gauge.axes is None else found.gauge.axes
     exact = 1e-4 if told is TURNED_PRIORS else 1e-9  # a robust fit is no fixed point after twenty rounds

@@ -22,8 +22,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.gauge_choice import GaugeRule
-from sfm_shapefit.pipeline.rigs import find_rigid_parts
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 from sfm_shapefit.placement.gauge import (
     distance_gauge,
     input_gauge,
@@ -33,6 +32,7 @@ from sfm_shapefit.placement.gauge import (
     prior_gauge,
     unit_gauge,
 )
+from sfm_shapefit.placement.gauge_rule import GaugeRule
 from sfm_shapefit.placement.prior_fit import compare_with_priors
 from sfm_shapefit.refinement.anchored import refine_anchored
 from sfm_shapefit.refinement.angular import plan_refinement, refine_angles
@@ -136,7 +136,7 @@ def test_a_known_distance_of_a_camera_that_is_not_placed_says_nothing():
     t, names = model.centers[:6], model.names
 
     def placed(*known):
-        rule = GaugeRule(model, find_rigid_parts(model), "auto", distances=known)
+        rule = GaugeRule(model, find_fixed_and_rigged(model), "auto", distances=known)
         return rule.choose(np.arange(6), t, None).similarity.apply(t)
 
     found = placed((names[1], names[4], 3.0), (names[2], names[7], 9.0))

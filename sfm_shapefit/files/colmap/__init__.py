@@ -16,13 +16,13 @@ def _import_pycolmap() -> None:
     """Import pycolmap for the first time, and let SIGTERM do what it did."""
     if "pycolmap" in sys.modules or threading.current_thread() is not threading.main_thread():
         return
-    before = signal.getsignal(signal.SIGTERM)
+    handler = signal.getsignal(signal.SIGTERM)
     others = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
     try:
         import pycolmap  # noqa: F401
 
-        if before is not None:  # None: of another library
-            signal.signal(signal.SIGTERM, before)
+        if handler is not None:  # None: of another library
+            signal.signal(signal.SIGTERM, handler)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, others)
 

@@ -87,9 +87,9 @@ def _panorama(size: tuple[float, float], params: Sequence[float]) -> tuple[float
     """
     if len(params) not in (0, 2, 3):
         return None
-    found = tuple(2.0 * x for x in params[1:]) if len(params) == 3 else tuple(params)
-    found = found if found and min(found) > 0.0 else tuple(map(float, size))
-    return found if min(found) > 0.0 else None
+    given = tuple(2.0 * x for x in params[1:]) if len(params) == 3 else tuple(params)
+    given = given if given and min(given) > 0.0 else tuple(map(float, size))
+    return given if min(given) > 0.0 else None
 
 
 def _completed(name: str, given: tuple[float, ...]) -> tuple[float, ...] | None:
@@ -111,5 +111,4 @@ def _defaults(name: str) -> tuple[float, ...]:
 
 
 def _listed(params: Sequence[float]) -> str:
-    """Return parameters as words."""
     return " ".join(f"{value:g}" for value in params)

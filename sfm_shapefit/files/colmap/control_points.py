@@ -32,8 +32,6 @@ _LINE = "x y z, two pixel coordinates, the name of an image, and perhaps that of
 
 
 class _Mark(NamedTuple):
-    """A line of the file."""
-
     number: int
     position: tuple[float, float, float]
     pixel: tuple[float, float]
@@ -68,11 +66,11 @@ def read_control_points(path: Path, images: Images) -> ControlPoints:
     marks = [_parse(path, number, line) for number, line in lines[1:]]
     _refuse_contradictions(path, marks)
     named = list(dict.fromkeys(mark.image for mark in marks))
-    found = same_images(named, images.names)
-    index_of_name = {name: k for name, k in zip(named, found.places.tolist(), strict=True) if k >= 0}
+    shown = same_images(named, images.names)
+    index_of_name = {name: k for name, k in zip(named, shown.places.tolist(), strict=True) if k >= 0}
     used = [mark for mark in marks if mark.image in index_of_name]
     if not used:
-        why = f" ({found.ambiguity})" if found.ambiguity else ""
+        why = f" ({shown.ambiguity})" if shown.ambiguity else ""
         raise InputError(f"{path} has no mark in an image of the model, such as {images.names[0]}{why}")
     names = sorted({mark.point for mark in used})
     place = {name: k for k, name in enumerate(names)}
@@ -126,7 +124,6 @@ def look_at_marks(images: Images, known: ControlPoints) -> MarkedViews:
 
 
 def _parse(path: Path, number: int, line: str) -> _Mark:
-    """Return the mark of a line."""
     cells = [cell.strip() for cell in (line.split("\t") if line.count("\t") >= 5 else line.split())]
     if len(cells) < 6 or not all(map(is_number, cells[:5])):
         raise InputError(f"{path}, line {number}: expected {_LINE}")
@@ -144,13 +141,13 @@ def _refuse_contradictions(path: Path, marks: list[_Mark]) -> None:
     first: dict[str, _Mark] = {}
     seen: set[tuple[str, str]] = set()
     for mark in marks:
-        before = first.setdefault(mark.point, mark)
+        earlier = first.setdefault(mark.point, mark)
         where = f"{path}, line {mark.number}: "
-        if before.position != mark.position:
+        if earlier.position != mark.position:
             raise InputError(
-                f"{where}{mark.point} has other coordinates than in line {before.number}; keep one position"
+                f"{where}{mark.point} has other coordinates than in line {earlier.number}; keep one position"
             )
-        if before.is_check != mark.is_check:
+        if earlier.is_check != mark.is_check:
             raise InputError(f"{where}{mark.point} is a check point in one line and none in another")
         if (mark.point, mark.image) in seen:
             raise InputError(f"{where}{mark.point} is marked twice in {mark.image}; keep one of its marks")

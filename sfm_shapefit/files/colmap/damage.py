@@ -28,6 +28,6 @@ class Damage:
 
     def tell(self) -> None:
         """Add the sentence that says what was left aside to the notes of the file, once."""
-        told = f"{self._file.path} is damaged; left aside: {'; '.join(self._left)}"
-        if self._left and told not in self._file.notes:
-            self._file.notes.append(told)
+        sentence = f"{self._file.path} is damaged; left aside: {'; '.join(self._left)}"
+        if self._left and sentence not in self._file.notes:
+            self._file.notes.append(sentence)

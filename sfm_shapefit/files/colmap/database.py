@@ -174,7 +174,6 @@ class DatabaseMatches(Matches):
         return pixels
 
     def _read_keypoints(self, name: str) -> npt.NDArray[np.float32]:
-        """Return the same from the file."""
         query = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
         found = self.file.query(query, self._ids[name]) if name in self._ids else []
         rows, cols, data = found[0] if found else (0, 0, b"")
@@ -231,11 +230,11 @@ class DatabaseMatches(Matches):
 
     def _stored_matches(self, chosen: IntArray) -> bytes:
         """Return the matches of pairs as the file lists them, one pair after the other."""
-        found = self.look_up(chosen, "cols, data")
-        for pair, (cols, data) in zip(chosen.tolist(), found, strict=True):
+        stored = self.look_up(chosen, "cols, data")
+        for pair, (cols, data) in zip(chosen.tolist(), stored, strict=True):
             if cols != 2 or not is_blob(data, int(self.num_matches[pair]), 2, itemsize=4):
                 raise self.damaged_pair(pair, "matches of wrong length")
-        return b"".join(data for _, data in found)
+        return b"".join(data for _, data in stored)
 
     def parts(self, view: View, ranges: Sequence[slice]) -> "list[DatabasePart]":
         """Return ranges of a view's pairs for other processes."""

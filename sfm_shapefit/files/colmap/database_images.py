@@ -136,7 +136,6 @@ def read_images(file: DatabaseFile) -> UnposedImages:
 
 
 def _put_in_rigs(alone: Images, rigs: DatabaseRigs) -> Images:
-    """Return images in the frames of their rigs."""
     places = rigs.place_of_image
     frame_ids = [places[i].frame_id if i in places else i for i in alone.ids.tolist()]
     ids, frame_of = np.unique(frame_ids, return_inverse=True)

@@ -103,7 +103,6 @@ def explain_no_pairs(file: DatabaseFile) -> str:
 
 
 def _has_rows(file: DatabaseFile, table: str) -> bool:
-    """Return whether an image or a pair of a table has anything."""
     return bool(file.query(f"SELECT 1 FROM {table} WHERE typeof(rows) != 'integer' OR rows != 0 LIMIT 1"))
 
 
@@ -134,10 +133,10 @@ def match_names(file: DatabaseFile, names: Sequence[str]) -> dict[int, int]:
         raise InputError(f"{path} has no images; run COLMAP's feature extraction and matching first")
     if len(matched) < 2:
         unmatched = next(name for index, name in enumerate(names) if index not in matched)
-        there = f", and the database's {example} is not in the model" if example is not None else ""
+        elsewhere = f", and the database's {example} is not in the model" if example is not None else ""
         raise InputError(
             f"{path} has {len(matched)} of the model's {len(names)} images: the model's {unmatched} is "
-            f"not in the database{there}; {ambiguity or 'give the database this model was made from'}"
+            f"not in the database{elsewhere}; {ambiguity or 'give the database this model was made from'}"
         )
     if ambiguity:
         file.notes.append(f"{path}: {ambiguity}")

@@ -97,7 +97,6 @@ def _rows(file: DatabaseFile, table: str, columns: tuple[str, ...], kind: str = 
 
 
 def _refuse_unknown_camera(path: Path, cameras: Collection[int], rig_id: object, *camera_ids: Any) -> None:
-    """Raise InputError if a rig has a camera that the database has not."""
     for camera_id in camera_ids:
         if not (is_between(camera_id, 0, NO_ID) and camera_id in cameras):
             raise InputError(f"{path}: rig {rig_id} refers to camera {camera_id!r}, which is not there")
@@ -129,10 +128,10 @@ def _places(
             raise InputError(f"{path}: frame {frame_id} has image {image_id} at another camera's place")
         if known:
             members.setdefault(frame_id, []).append(image_id)
-    found: dict[int, InFrame] = {}
+    frame_of: dict[int, InFrame] = {}
     for frame_id, image_ids in members.items():
         cameras = [camera_of[i] for i in image_ids]
-        if len(set(cameras)) < len(cameras) or any(i in found for i in image_ids):
+        if len(set(cameras)) < len(cameras) or any(i in frame_of for i in image_ids):
             raise InputError(f"{path}: an image of frame {frame_id} stands twice; configure rigs again")
-        found |= {i: InFrame(rig_of_frame.get(frame_id, -1), min(image_ids)) for i in image_ids}
-    return found
+        frame_of |= {i: InFrame(rig_of_frame.get(frame_id, -1), min(image_ids)) for i in image_ids}
+    return frame_of

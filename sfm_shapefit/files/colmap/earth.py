@@ -28,16 +28,16 @@ def epsg_code(name: str, datum: Datum) -> int:
     Raises:
         InputError: if it is none of these, or a zone that the scene is far from.
     """
-    own, word = _zone_of(datum), name.strip().lower()
+    zone, word = _zone_of(datum), name.strip().lower()
     code = int(word[5:]) if re.fullmatch(r"epsg:\d{4,5}", word) else 0
-    code = own if word == "utm" else code
+    code = zone if word == "utm" else code
     if code != _ECEF and not (code // 100 * 100 in (_NORTH, _SOUTH) and 1 <= code % 100 <= 60):
         raise InputError(
             f"{name!r} is no system that models are converted to; give utm, the EPSG code of a zone of UTM "
             "on WGS84 (EPSG:32601 to 32660, south EPSG:32701 to 32760), or EPSG:4978 (Earth-centered)"
         )
     if code != _ECEF and abs(_wrapped(datum.longitude_deg - _middle_deg(code))) > _FARTHEST_DEG:
-        raise InputError(f"{name} is far from the model, which lies in EPSG:{own}; give that, or utm")
+        raise InputError(f"{name} is far from the model, which lies in EPSG:{zone}; give that, or utm")
     return code
 
 
@@ -65,7 +65,6 @@ def _zone_of(datum: Datum) -> int:
 
 
 def _middle_deg(code: int) -> float:
-    """Return the longitude of the middle of a zone."""
     return 6.0 * (code % 100) - 183.0
 
 

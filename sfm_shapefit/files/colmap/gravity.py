@@ -51,11 +51,11 @@ def table_gravity(path: Path, images: Images) -> Gravity:
             )
         rows[cells[0]] = [*direction, sigma]
     same = same_images(list(rows), images.names)
-    found = {k: row for k, row in zip(same.places.tolist(), rows.values(), strict=True) if k >= 0}
-    if not found:
+    gravities = {k: row for k, row in zip(same.places.tolist(), rows.values(), strict=True) if k >= 0}
+    if not gravities:
         why = same.ambiguity or f"such as {images.names[0]}"
         raise InputError(f"{path} has no gravity of the model's images, {why}")
-    return _gravity(found)
+    return _gravity(gravities)
 
 
 def database_gravity(file: DatabaseFile, images: Images) -> Gravity:
@@ -65,7 +65,7 @@ def database_gravity(file: DatabaseFile, images: Images) -> Gravity:
         InputError: if the database has none of these images, or a damaged one.
     """
     query = f"SELECT images.name, gravity FROM pose_priors JOIN images ON {PRIORS_OF_IMAGES}"
-    found: dict[int, list[float]] = {}
+    gravities: dict[int, list[float]] = {}
     columns = ("corr_data_id", "corr_sensor_type", "gravity")
     rows = file.rows("pose_priors", {columns: query})
     places = same_images([str(name) for name, _ in rows], images.names).places.tolist()
@@ -78,15 +78,15 @@ def database_gravity(file: DatabaseFile, images: Images) -> Gravity:
             )
         values = np.frombuffer(blob, dtype="<f8")
         if 1.0 / _LARGEST <= float(np.linalg.norm(values)) <= _LARGEST:
-            found[place] = [*values.tolist(), _SIGMA_DEG]
-    if not found:
+            gravities[place] = [*values.tolist(), _SIGMA_DEG]
+    if not gravities:
         raise InputError(f"{file.path} has no gravity of its images; give a table (gravity=FILE)")
-    return _gravity(found)
+    return _gravity(gravities)
 
 
-def _gravity(found: dict[int, list[float]]) -> Gravity:
-    indices = sorted(found)
-    values = np.array([found[k] for k in indices])
+def _gravity(gravities: dict[int, list[float]]) -> Gravity:
+    indices = sorted(gravities)
+    values = np.array([gravities[k] for k in indices])
     lengths = np.linalg.norm(values[:, :3], axis=1, keepdims=True)
     sigmas = np.array([math.radians(sigma) for sigma in values[:, 3].tolist()])
     return Gravity(np.array(indices, dtype=np.int64), values[:, :3] / lengths, sigmas)

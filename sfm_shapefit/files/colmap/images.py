@@ -46,11 +46,11 @@ def put_images(model: ModelArrays, images: Images) -> ModelArrays:
     lenses = {lens.id: lens.parameters for lens in images.lenses}
     rows = np.searchsorted(model.frames.ids, images.frames.ids)
     poses, posed = model.frames.poses.copy(), images.frames.is_posed
-    before = _poses(poses[rows])
+    earlier = _poses(poses[rows])
     for k, row in enumerate(rows.tolist()):
         rotation, center = images.frames.rotations[k], images.frames.centers[k]
-        turns = bool((rotation != before[0][k]).any())
-        if posed[k] and (turns or (center != before[1][k]).any()):
+        turns = bool((rotation != earlier[0][k]).any())
+        if posed[k] and (turns or (center != earlier[1][k]).any()):
             poses[row, 4:] = -(rotation @ center)
             if turns:
                 poses[row, :4] = pycolmap.Rotation3d(rotation).quat[[3, 0, 1, 2]]
@@ -60,25 +60,29 @@ def put_images(model: ModelArrays, images: Images) -> ModelArrays:
         rigs=_put_sensors(model.rigs, images),
         lenses=tuple(replace(lens, parameters=lenses.get(lens.id, lens.parameters)) for lens in model.lenses),
     )
-    lost = rows[~posed & np.isfinite(before[0]).all(axis=(1, 2))]  # its position may be NaN
+    lost = rows[~posed & np.isfinite(earlier[0]).all(axis=(1, 2))]  # its position may be NaN
     return moved.without_poses(lost) if len(lost) else moved
 
 
 def _put_sensors(rigs: Sequence[RigRecord], images: Images) -> tuple[RigRecord, ...]:
     """Return rigs whose cameras stand as in `images`; other sensors of theirs scale with these."""
     ids, after = [lens.id for lens in images.lenses], images.sensors
-    before, changed = sensors_of(rigs, ids), []
+    earlier, changed = sensors_of(rigs, ids), []
     for rig in rigs:
-        own = [k for k, camera_id in enumerate(ids) if (CAMERA_SENSOR, camera_id) in rig.sensors]
-        lengths = [np.linalg.norm(sensors.translations[own], axis=1).sum() for sensors in (before, after)]
+        members = [k for k, camera_id in enumerate(ids) if (CAMERA_SENSOR, camera_id) in rig.sensors]
+        lengths = [
+            np.linalg.norm(sensors.translations[members], axis=1).sum() for sensors in (earlier, after)
+        ]
         sensors = dict(rig.sensors)
         if lengths[0] > 0.0 and lengths[1] > 0.0 and lengths[0] != lengths[1]:
             for sensor, pose in rig.poses.items():
                 if sensor[1] not in ids:
                     sensors[sensor] = np.append(pose[:4], lengths[1] / lengths[0] * pose[4:])
-        for k in own:
+        for k in members:
             rotation, translation = after.rotations[k], after.translations[k]
-            changes = (rotation != before.rotations[k]).any() or (translation != before.translations[k]).any()
+            changes = (rotation != earlier.rotations[k]).any() or (
+                translation != earlier.translations[k]
+            ).any()
             if changes and np.isfinite(translation).all():
                 turn = pycolmap.Rotation3d(rotation)
                 sensors[CAMERA_SENSOR, ids[k]] = pose_of(pycolmap.Rigid3d(turn, translation))

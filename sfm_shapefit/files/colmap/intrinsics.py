@@ -71,21 +71,21 @@ def find_uncalibrated(
     places = same_images([str(name) for name, _ in rows], images.names).places.tolist()
     camera_ids = {place: camera_id for place, (_, camera_id) in zip(places, rows, strict=True)}
     cameras = read_cameras(database).usable
-    found: dict[int, Uncalibrated] = {}
+    uncalibrated: dict[int, Uncalibrated] = {}
     for image, number in enumerate(images.lens_of.tolist()):
         lens, camera = images.lenses[number], cameras.get(camera_ids.get(image, -1))
-        if number in found or camera is None or camera.model_name != lens.model:
+        if number in uncalibrated or camera is None or camera.model_name != lens.model:
             continue
         focal = camera.focal_length_idxs()[:1]  # none of a panorama
         if focal and (lens.parameters == tuple(camera.params.tolist()) or lens.id in listed):
             ratio = float(camera.params[focal[0]] / lens.parameters[focal[0]])
-            found[number] = Uncalibrated(_origin(camera), camera.camera_id, ratio)
-    origins = [one.origin for one in found.values()]
+            uncalibrated[number] = Uncalibrated(_origin(camera), camera.camera_id, ratio)
+    origins = [one.origin for one in uncalibrated.values()]
     known = {Origin.CALIBRATION}
     if origins.count(Origin.EXIF) < origins.count(Origin.CALIBRATION):
         # A calibration leaves the distortion as it was where the images do not tell it; EXIF does everywhere.
         known.add(Origin.EXIF)
-    return {number: one for number, one in found.items() if one.origin not in known}
+    return {number: one for number, one in uncalibrated.items() if one.origin not in known}
 
 
 def fisheye_guess(camera: pycolmap.Camera) -> float:
@@ -124,14 +124,14 @@ def calibrate_view_graph(
         InputError: if the database cannot be read.
     """
     tables = _read_tables(database, left_out)
-    asked = _with_enough_pairs(tables, set(cameras))
-    if not asked:
+    doubted = _with_enough_pairs(tables, set(cameras))
+    if not doubted:
         return {}
     with tempfile.TemporaryDirectory(prefix="shapefit-") as folder:
         private = Path(folder) / "database.db"
         pycolmap.Database.open(private).close()
-        _fill(private, tables, asked)
-        before = _focal_lengths(private)
+        _fill(private, tables, doubted)
+        earlier = _focal_lengths(private)
         options = pycolmap.ViewGraphCalibrationOptions()
         options.random_seed, options.reestimate_relative_pose = 0, False
         options.cross_validate_prior_focal_lengths = False
@@ -141,7 +141,7 @@ def calibrate_view_graph(
         except PYCOLMAP_ERRORS:
             return {}
         after = _focal_lengths(private)
-    factors = {camera: round(after[camera] / before[camera], _DIGITS) for camera in asked}
+    factors = {camera: round(after[camera] / earlier[camera], _DIGITS) for camera in doubted}
     return {i: f for i, f in sorted(factors.items()) if done and np.isfinite(f) and f not in (0.0, 1.0)}
 
 
@@ -158,7 +158,7 @@ def _read_tables(database: DatabaseFile, left_out: PairNames) -> dict[str, Rows]
         "typeof(F) = 'blob' AND length(F) = 72 AND typeof(pair_id) = 'integer' AND typeof(rows) = 'integer'"
     )
     which = f"WHERE {is_whole} ORDER BY rows DESC, pair_id LIMIT {most}"
-    found = {
+    tables = {
         table: database.rows(table, {columns: f"SELECT {', '.join(columns)} FROM {table} {chosen}"})
         for table, columns, chosen in (
             ("images", ("image_id", "name", "camera_id"), ""),
@@ -166,13 +166,13 @@ def _read_tables(database: DatabaseFile, left_out: PairNames) -> dict[str, Rows]
         )
     }
     cameras = read_cameras(database).usable
-    images = [row for row in found["images"] if row[2] in cameras]
+    images = [row for row in tables["images"] if row[2] in cameras]
     ids = {name: image_id for image_id, name, _ in images}
     unwanted = {MAX_NUM_IMAGES * min(ends) + max(ends) for ends in indices_of_pairs(ids, left_out).tolist()}
     known = {*ids.values()}
     kept = [
         row
-        for row in found["two_view_geometries"]
+        for row in tables["two_view_geometries"]
         if row[0] not in unwanted and known.issuperset(divmod(row[0], MAX_NUM_IMAGES))
     ]
     rows: Rows = [
@@ -181,20 +181,20 @@ def _read_tables(database: DatabaseFile, left_out: PairNames) -> dict[str, Rows]
     return {"cameras": rows, "images": images, "two_view_geometries": kept[:_MOST_PAIRS]}
 
 
-def _with_enough_pairs(tables: Mapping[str, Rows], asked: set[int]) -> set[int]:
+def _with_enough_pairs(tables: Mapping[str, Rows], doubted: set[int]) -> set[int]:
     """Return the cameras among those asked whose pairs have depth often enough."""
     camera_of = {image: camera for image, _, camera in tables["images"]}
-    all_pairs, deep = dict.fromkeys(asked, 0), dict.fromkeys(asked, 0)
+    all_pairs, deep = dict.fromkeys(doubted, 0), dict.fromkeys(doubted, 0)
     for pair_id, _, config, _ in tables["two_view_geometries"]:
-        for camera in asked.intersection(camera_of.get(i, -1) for i in divmod(pair_id, MAX_NUM_IMAGES)):
+        for camera in doubted.intersection(camera_of.get(i, -1) for i in divmod(pair_id, MAX_NUM_IMAGES)):
             all_pairs[camera] += 1
             deep[camera] += config in _WITH_DEPTH
-    return {c for c in asked if deep[c] >= max(_FEWEST_PAIRS, _LEAST_SHARE * all_pairs[c])}
+    return {c for c in doubted if deep[c] >= max(_FEWEST_PAIRS, _LEAST_SHARE * all_pairs[c])}
 
 
-def _fill(private: Path, tables: Mapping[str, Rows], asked: set[int]) -> None:
+def _fill(private: Path, tables: Mapping[str, Rows], doubted: set[int]) -> None:
     """Write the view graph into an empty database of our own; what is not asked is a prior there."""
-    cameras = [(*row[:5], int(row[0] not in asked)) for row in tables["cameras"]]
+    cameras = [(*row[:5], int(row[0] not in doubted)) for row in tables["cameras"]]
     pairs = [(p, 0, 2, b"", c, f) for p, _, c, f in tables["two_view_geometries"] if c in _WITH_DEPTH]
     with closing(sqlite3.connect(private)) as opened, opened:
         opened.executemany("INSERT INTO cameras VALUES (?, ?, ?, ?, ?, ?)", cameras)

@@ -21,8 +21,8 @@ def camera_of(lens: Lens) -> pycolmap.Camera:
 
 def focal_lengths(lens: Lens) -> list[float]:
     """Return the one or two focal lengths of a lens, in pixels; of a panorama its pixels per radian."""
-    found = [lens.parameters[k] for k in camera_of(lens).focal_length_idxs()]
-    return found or [lens.focal_px]
+    lengths = [lens.parameters[k] for k in camera_of(lens).focal_length_idxs()]
+    return lengths or [lens.focal_px]
 
 
 def lens_of(camera: pycolmap.Camera) -> Lens:

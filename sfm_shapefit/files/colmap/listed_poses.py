@@ -112,8 +112,8 @@ def read_list(file: Path, database: Path | str | None) -> tuple[ModelArrays, fro
             f"{file} and {database} have fewer than two images in common: "
             f"{poses.names[0] if poses.names else 'none'} in the one, {read.images.names[0]} in the other"
         )
-    there = np.isin(read.images.frame_of, read.images.frame_of[rows[rows >= 0]])
-    images, place = read.images.part(np.flatnonzero(there)), np.append(np.cumsum(there) - 1, -1)
+    listed = np.isin(read.images.frame_of, read.images.frame_of[rows[rows >= 0]])
+    images, place = read.images.part(np.flatnonzero(listed)), np.append(np.cumsum(listed) - 1, -1)
     model = put_images(read.template(images).model, _pose(images, place[rows], poses))
     numbers = np.where(rows >= 0, read.images.lens_of[rows], -1)
     lenses, guessed = {lens.id: lens for lens in model.lenses}, set[int]()
@@ -124,8 +124,8 @@ def read_list(file: Path, database: Path | str | None) -> tuple[ModelArrays, fro
             guessed |= {lens.id} if is_guess else set()
     model = replace(model, lenses=tuple(lenses.values()))
     lost = [name for name, row in zip(poses.names, rows.tolist(), strict=True) if row < 0]
-    said = f"the database lacks {counted(len(lost), 'image')} of {file.name}: {first_of(lost)}"
-    return model, frozenset(guessed), (*poses.notes, said) if lost else poses.notes
+    note = f"the database lacks {counted(len(lost), 'image')} of {file.name}: {first_of(lost)}"
+    return model, frozenset(guessed), (*poses.notes, note) if lost else poses.notes
 
 
 def _pose(images: Images, rows: IntArray, poses: ListedPoses) -> Images:
@@ -139,13 +139,13 @@ def _pose(images: Images, rows: IntArray, poses: ListedPoses) -> Images:
     found = np.flatnonzero(rows >= 0)
     lenses, frames = images.lens_of[rows[found]], images.frame_of[rows[found]]
     turns, shifts = images.sensors.rotations[lenses], images.sensors.translations[lenses]
-    own = np.swapaxes(turns, 1, 2) @ poses.rotations[found]
+    turned = np.swapaxes(turns, 1, 2) @ poses.rotations[found]
     places = poses.centers[found] + np.einsum("kba,kb->ka", poses.rotations[found], shifts)
     rotations, centers = (np.full_like(a, np.nan) for a in (images.frames.rotations, images.frames.centers))
     order = np.argsort(frames, kind="stable")
     known, first = np.unique(frames[order], return_index=True)
     for frame, part in zip(known.tolist(), np.split(order, first[1:]), strict=True):
-        rotations[frame] = own[part[0]] if len(part) == 1 else mean_rotation_l1(own[part])
+        rotations[frame] = turned[part[0]] if len(part) == 1 else mean_rotation_l1(turned[part])
         centers[frame] = places[part].mean(axis=0)
     return images.posed(rotations, centers)
 

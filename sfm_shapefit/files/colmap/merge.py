@@ -64,18 +64,18 @@ def _add_frames(
     rig_ids: dict[int, int],
 ) -> dict[int, int]:
     """Add the posed frames that only the second model has, and return the new ids of all its posed images."""
-    there = {name_of(joined.image(i)): i for i in joined.reg_image_ids()}
+    first_ids = {name_of(joined.image(i)): i for i in joined.reg_image_ids()}
     named = {i: name_of(second.image(i)) for i in second.reg_image_ids()}
-    ids = {i: there[name] for i, name in named.items() if name in there}
+    ids = {i: first_ids[name] for i, name in named.items() if name in first_ids}
     fresh = max([*joined.images, *second.images, *joined.frames, *second.frames], default=0) + 1
     for frame_id in sorted(second.reg_frame_ids()):
-        own = [data.id for data in second.frame(frame_id).image_ids]
-        if shared := [i for i in own if i in ids]:
-            if len(shared) < len(own):
+        members = [data.id for data in second.frame(frame_id).image_ids]
+        if shared := [i for i in members if i in ids]:
+            if len(shared) < len(members):
                 name = named[shared[0]]
                 raise InputError(f"a rig took {name} with images that only one of two models has")
             continue
-        for i in own:
+        for i in members:
             ids[i] = i if i not in joined.images else fresh
             fresh += ids[i] == fresh
         new_id = frame_id if frame_id not in joined.frames else fresh
@@ -84,7 +84,7 @@ def _add_frames(
             joined,
             second.frame(frame_id),
             new_id,
-            [second.image(i) for i in sorted(own)],
+            [second.image(i) for i in sorted(members)],
             _Renamed(cameras, rig_ids, ids),
         )
     return ids
@@ -105,7 +105,6 @@ def _add_frame(
     images: Sequence[pycolmap.Image],
     renamed: _Renamed,
 ) -> None:
-    """Add a posed frame of a second model with its images."""
     copies = [
         pycolmap.Image(
             name=bytes_of_name(name_of(image)),
@@ -131,19 +130,19 @@ def _add_keypoints(image: pycolmap.Image, other: pycolmap.Image) -> IntArray:
 
     What lies at none of its own is added behind these.
     """
-    own, others = points2d_xy(image), points2d_xy(other)
-    if own.shape == others.shape and (np.abs(own - others) <= _SAME_PIXEL).all():
-        return np.arange(len(own))
+    mine, others = points2d_xy(image), points2d_xy(other)
+    if mine.shape == others.shape and (np.abs(mine - others) <= _SAME_PIXEL).all():
+        return np.arange(len(mine))
     places = np.full(len(others), -1)
-    if len(own) and len(others):
+    if len(mine) and len(others):
         from scipy.spatial import KDTree  # here, since it takes long to import
 
-        apart, nearest = map(np.asarray, KDTree(own).query(others))
-        is_mutual = np.asarray(KDTree(others).query(own)[1])[nearest] == np.arange(len(others))
+        apart, nearest = map(np.asarray, KDTree(mine).query(others))
+        is_mutual = np.asarray(KDTree(others).query(mine)[1])[nearest] == np.arange(len(others))
         is_same = is_mutual & (apart <= _SAME_PIXEL)
         places[is_same] = nearest[is_same]
     fresh = np.flatnonzero(places < 0)
-    places[fresh] = len(own) + np.arange(len(fresh))
+    places[fresh] = len(mine) + np.arange(len(fresh))
     points2d = [*image.points2D, *pycolmap.Image(keypoints=others[fresh]).points2D]
     image.points2D.clear()  # the setter insists on it
     image.points2D = pycolmap.Point2DList(points2d)
@@ -193,13 +192,15 @@ def _add_rig(
     cameras: dict[int, int],
 ) -> int:
     """Add a rig and note the ids of its cameras; return its id. One that is there serves."""
-    own = sorted(sensor.id for sensor in rig.sensor_ids())
-    for rig_id, there in joined.rigs.items():
-        if _is_same_rig(there, rig) and all(_is_same_camera(joined.camera(i), second.camera(i)) for i in own):
-            cameras |= {i: i for i in own}
+    members = sorted(sensor.id for sensor in rig.sensor_ids())
+    for rig_id, known in joined.rigs.items():
+        if _is_same_rig(known, rig) and all(
+            _is_same_camera(joined.camera(i), second.camera(i)) for i in members
+        ):
+            cameras |= {i: i for i in members}
             return int(rig_id)
     added = pycolmap.Rig(rig_id=_free_id(joined, second) if rig.rig_id in joined.rigs else rig.rig_id)
-    for camera_id in own:
+    for camera_id in members:
         taken = camera_id in joined.cameras
         cameras[camera_id] = _free_id(joined, second) if taken else camera_id
         joined.add_camera(_renamed(second.camera(camera_id), cameras[camera_id]))

@@ -27,10 +27,7 @@ from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.lenses import focal_lengths
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays, RigRecord
 from sfm_shapefit.files.colmap.read_binary import read_folder
-from sfm_shapefit.files.colmap.reconstructions import (
-    arrays_of,
-    reconstruction_of,
-)
+from sfm_shapefit.files.colmap.reconstructions import arrays_of, reconstruction_of
 from sfm_shapefit.files.norms import are_off, say_normalized
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import names_among
@@ -179,7 +176,6 @@ def _with_positions(label: str, model: ColmapModel) -> ColmapModel:
 
 
 def _posed_model(label: str, model: ColmapModel) -> ColmapModel:
-    """Return a model of which `images` are those with a pose."""
     every, arrays = model.images, model.arrays
     has_pose = arrays.frames.is_posed[arrays.images.frame_of[arrays.images.rows(every.ids)]]
     images = every.part(np.flatnonzero(has_pose))

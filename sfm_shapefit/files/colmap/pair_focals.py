@@ -60,16 +60,16 @@ def read_pair_focals(
     cameras, ids = read_cameras(database).usable, dict(database.query("SELECT name, image_id FROM images"))
     ends = indices_of_pairs(ids, left_out).tolist()
     unwanted = {MAX_NUM_IMAGES * min(pair) + max(pair) for pair in ends}
-    found: dict[int, list[tuple[float, float, float]]] = {}
+    by_camera: dict[int, list[tuple[float, float, float]]] = {}
     for pair_id, count, *blobs in rows:
         is_one_sided = None in blobs
         for blob in blobs if pair_id not in unwanted else ():
             camera_id, focal = _focal(blob)
             if camera_id in cameras and camera_id in asked and isinstance(count, int) and focal > 0.0:
-                own = found.setdefault(camera_id, [])
+                of_camera = by_camera.setdefault(camera_id, [])
                 factor = focal / cameras[camera_id].params[0]
-                own.append((np.log(factor), float(count), float(is_one_sided)))
-    agreed = {i: _agreed(np.array(own[:_MOST_OF_CAMERA])) for i, own in sorted(found.items())}
+                of_camera.append((np.log(factor), float(count), float(is_one_sided)))
+    agreed = {i: _agreed(np.array(of_camera[:_MOST_OF_CAMERA])) for i, of_camera in sorted(by_camera.items())}
     return {i: one for i, one in agreed.items() if one is not None}
 
 

@@ -62,12 +62,12 @@ def colors_of_pictures(
 
     sums, counts, unread = np.zeros(known.shape), np.zeros(len(known)), []
     with quiet_log(), ThreadPoolExecutor(pictures.threads) as pool:
-        for (image, _, rows), found in zip(jobs, pool.map(look, jobs), strict=True):
-            if found is None:
+        for (image, _, rows), colors in zip(jobs, pool.map(look, jobs), strict=True):
+            if colors is None:
                 unread.append(images.names[image])
                 continue
-            inside = np.isfinite(found[:, 0])
-            np.add.at(sums, seen[rows[inside]], found[inside])
+            inside = np.isfinite(colors[:, 0])
+            np.add.at(sums, seen[rows[inside]], colors[inside])
             np.add.at(counts, seen[rows[inside]], 1.0)
     means = np.floor(sums / np.maximum(counts, 1.0)[:, None] + 0.5).astype(np.uint8)
     return np.where(is_open[:, None], means, known), tuple(unread)
@@ -83,12 +83,12 @@ def _sample(picture: Rgb, keypoints: FloatArray, lens_px: FloatArray) -> FloatAr
     xy = keypoints * (size / lens_px if lens_px.all() else 1.0) - 0.5
     low = np.floor(xy).astype(np.int64)
     inside = np.asarray(((low >= 0) & (low + 1 < size)).all(axis=1))
-    found = np.full((len(xy), 3), np.nan)
+    colors = np.full((len(xy), 3), np.nan)
     (x, y), (right, below) = low[inside].T, (xy - low)[inside].T[:, :, None]
     top = picture[y, x] * (1.0 - right) + picture[y, x + 1] * right
     bottom = picture[y + 1, x] * (1.0 - right) + picture[y + 1, x + 1] * right
-    found[inside] = top * (1.0 - below) + bottom * below
-    return found
+    colors[inside] = top * (1.0 - below) + bottom * below
+    return colors
 
 
 def color_model(

@@ -54,18 +54,18 @@ class PictureMatches:
         names = self.model.images.names
         files = find_pictures(folder, names)
         states: list[PictureState] = ["missing" if file is None else "not asked" for file in files]
-        there = [k for k, file in enumerate(files) if file is not None]
-        there = [there[k] for k in np.random.default_rng(_SEED).permutation(len(there)).tolist()]
+        readable = [k for k, file in enumerate(files) if file is not None]
+        readable = [readable[k] for k in np.random.default_rng(_SEED).permutation(len(readable)).tolist()]
         with quiet_log(), pycolmap.Database.open(self.database) as database:
             self._write_images(database)
-            for begin in range(0, len(there), _PICTURES_AT_ONCE):
+            for begin in range(0, len(readable), _PICTURES_AT_ONCE):
                 if begin and is_over():
                     break
-                some = {k: os.fsencode(files[k] or "") for k in there[begin : begin + _PICTURES_AT_ONCE]}
+                some = {k: os.fsencode(files[k] or "") for k in readable[begin : begin + _PICTURES_AT_ONCE]}
                 with pycolmap.DatabaseTransaction(database):
                     for k, state in zip(some, self._detect_some(database, folder, some), strict=True):
                         states[k] = state
-                advance(begin + len(some), len(there))
+                advance(begin + len(some), len(readable))
         return states
 
     def _write_images(self, database: pycolmap.Database) -> None:

@@ -111,14 +111,14 @@ def _turned_faces(camera: pycolmap.Camera, across: float, along: float) -> list[
     turns = [("right", yaw, 0.0), ("left", -yaw, 0.0)] * (across > _WIDEST)
     turns += [("up", 0.0, pitch), ("down", 0.0, -pitch)] * (along > _WIDEST)
     shape = np.minimum(1.0, np.tan(np.minimum([across, along], _HALF_FACE)))
-    found = []
+    faces = []
     for name, *at in turns:
         for share in np.arange(1.0, _NARROWEST, -0.02):
             face = Pinhole(name, *_face(2 * round(camera.mean_focal_length()), share * shape, *at))
             if _lies_inside(camera, face):
-                found.append(face)
+                faces.append(face)
                 break
-    return found or [_whole(camera)]
+    return faces or [_whole(camera)]
 
 
 def _face(size: int, shape: FloatArray, yaw: float, pitch: float) -> tuple[pycolmap.Camera, FloatArray]:
@@ -135,19 +135,18 @@ def _face(size: int, shape: FloatArray, yaw: float, pitch: float) -> tuple[pycol
 def _maps_of(camera: pycolmap.Camera, pinhole: Pinhole) -> Maps:
     """Return where the pixels of a picture come from, as OpenCV counts them."""
     width, height = pinhole.camera.width, pinhole.camera.height
-    found = np.empty((height, width, 2), dtype=np.float32)
+    maps = np.empty((height, width, 2), dtype=np.float32)
     for y in range(height):  # all at once would take ten times the memory
-        found[y] = _sources(camera, pinhole, np.arange(width), np.full(width, y))
-    return found[..., 0], found[..., 1]
+        maps[y] = _sources(camera, pinhole, np.arange(width), np.full(width, y))
+    return maps[..., 0], maps[..., 1]
 
 
 def _lies_inside(camera: pycolmap.Camera, pinhole: Pinhole) -> bool:
-    """Return whether the border of a picture comes from inside that of a camera."""
     width, height = pinhole.camera.width, pinhole.camera.height
     x, y = np.arange(width), np.arange(height)
     across, along = np.r_[x, x, 0 * y, 0 * y + width - 1], np.r_[0 * x, 0 * x + height - 1, y, y]
-    found = _sources(camera, pinhole, across, along)
-    return bool(((found >= 0.0) & (found <= [camera.width - 1, camera.height - 1])).all())
+    sources = _sources(camera, pinhole, across, along)
+    return bool(((sources >= 0.0) & (sources <= [camera.width - 1, camera.height - 1])).all())
 
 
 def _sources(camera: pycolmap.Camera, pinhole: Pinhole, x: IntArray, y: IntArray) -> FloatArray:
@@ -188,11 +187,11 @@ def _names(name: str, pinholes: Sequence[Pinhole], taken: set[str]) -> list[str]
     """Return names in one folder, where 3DGS looks for them; `taken` has those in use, and gets these."""
     stem, suffix = os.path.splitext(name.replace("/", "_").replace("\\", "_"))
     suffix = suffix if suffix.lower() in _WRITTEN else ".png"
-    found = [f"{stem}_{pinhole.name}{suffix}" if pinhole.name else f"{stem}{suffix}" for pinhole in pinholes]
-    if not taken.isdisjoint(found):
+    names = [f"{stem}_{pinhole.name}{suffix}" if pinhole.name else f"{stem}{suffix}" for pinhole in pinholes]
+    if not taken.isdisjoint(names):
         return _names(f"{stem}_{suffix}", pinholes, taken)
-    taken.update(found)
-    return found
+    taken.update(names)
+    return names
 
 
 def write_flats(flats: Sequence[Flat], folder: Path, threads: int) -> Iterator[str]:

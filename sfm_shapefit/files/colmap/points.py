@@ -41,8 +41,8 @@ class ModelPictures:
     def project(self, image: int, positions: FloatArray, *, ahead: bool = True) -> FloatArray:
         """Return the pixels (k, 2) of points (k, 3) in axes of the camera; of all, or of those it sees."""
         camera = self._cameras[self._lens_of[image]]
-        found = camera.img_from_cam(positions, check_cheirality=ahead)
-        return np.asarray(found, dtype=np.float64).reshape(-1, 2)
+        pixels = camera.img_from_cam(positions, check_cheirality=ahead)
+        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
     def _pixels(self, image: int) -> FloatArray:
         """Return the pixels of an image, (k, 2)."""

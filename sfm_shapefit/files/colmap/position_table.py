@@ -94,8 +94,6 @@ class PositionTable(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """What the columns of a table are."""
-
     roles: Sequence[str]
     """By column: name, an axis as in `_AXES`, or the axes of a sigma, cov or ref; ? or empty for others."""
     axes: Sequence[str]
@@ -187,12 +185,11 @@ def _role_of(word: str) -> str:
 
 
 def _words(word: str) -> list[str]:
-    """Return the words of a column's name, in small letters."""
-    found: list[str] = []
+    words: list[str] = []
     for one in map(str.lower, _WORD.findall(word)):
         fused = _FUSED.fullmatch(one)
-        found += ["std", fused[fused.lastindex or 0]] if fused else [one.removeprefix("gps") or one]
-    return found
+        words += ["std", fused[fused.lastindex or 0]] if fused else [one.removeprefix("gps") or one]
+    return words
 
 
 def _axes_of(roles: Sequence[str]) -> tuple[str, ...]:
@@ -294,7 +291,7 @@ def _value(cell: str) -> float:
     if match := _HEIGHT.fullmatch(cell):
         return -float(match[1]) if match[2] and match[2].lower() == "below" else float(match[1])
     if match := _DEGREES.fullmatch(cell):
-        before, degrees, minutes, seconds, after = match.groups()
+        sign, degrees, minutes, seconds, after = match.groups()
         size = abs(float(degrees)) + float(minutes or 0.0) / 60.0 + float(seconds or 0.0) / 3600.0
-        return -size if degrees[0] in "-" or (before + after).lower() in ("s", "w") else size
+        return -size if degrees[0] in "-" or (sign + after).lower() in ("s", "w") else size
     raise ValueError(repr(cell))

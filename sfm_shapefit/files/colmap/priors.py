@@ -63,8 +63,8 @@ def database_priors(file: DatabaseFile, images: Images) -> PositionPriors:
     covariances = np.array([_numbers(path, row.name, row.covariance, 9) for row in rows]).reshape(-1, 3, 3)
     known = (np.abs(positions[:, :2]) <= LARGEST).all(axis=1)
     known &= same_images([row.name for row in rows], images.names).places >= 0
-    told = [row.system for row, is_known in zip(rows, known, strict=True) if is_known]
-    system, notes = _system_of(path, told, positions[known])
+    systems = [row.system for row, is_known in zip(rows, known, strict=True) if is_known]
+    system, notes = _system_of(path, systems, positions[known])
     notes += [
         f"{path}: {counted_are(n, 'pose prior')} of {whose}, and not used" for whose, n in unused.items()
     ]
@@ -133,8 +133,8 @@ def in_meters(table: PositionTable, source: str, datum: Datum | None = None) -> 
             "the columns lat, lon, alt, or x_m, y_m, z_m if they are lengths"
         )
     is_geodetic = table.system == "geodetic"
-    there = np.abs(table.positions) <= LARGEST
-    known: BoolArray = np.asarray(there[:, : 2 if is_geodetic else 3].all(axis=1))
+    near = np.abs(table.positions) <= LARGEST
+    known: BoolArray = np.asarray(near[:, : 2 if is_geodetic else 3].all(axis=1))
     if lost := int(np.sum(~known)):
         notes.append(f"{source}: {counted_are(lost, 'position')} missing or not finite, of {len(known)}")
     table = table.part(known)
@@ -142,7 +142,7 @@ def in_meters(table: PositionTable, source: str, datum: Datum | None = None) -> 
     if bad := int(np.sum(np.linalg.eigvalsh(stated)[:, 0] <= 0.0)):
         notes.append(f"{source}: {counted_are(bad, 'covariance')} not positive definite, and not used")
     if is_geodetic and len(table.names):
-        table = table._replace(positions=_with_altitudes(table.positions, there[known, 2], source, notes))
+        table = table._replace(positions=_with_altitudes(table.positions, near[known, 2], source, notes))
         datum = datum or datum_of(table.positions)
         try:
             table = table._replace(positions=enu_of(table.positions, datum), datum=datum)

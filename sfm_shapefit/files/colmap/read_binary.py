@@ -116,11 +116,12 @@ def read_folder(folder: Path) -> tuple[ModelArrays, tuple[str, ...]]:
     suffix = model_suffix(folder)
     for name in (*REQUIRED_FILES, "points3D", "rigs", "frames"):
         refuse_irregular_file(folder / f"{name}{suffix}")
-    there = [name for name in ("rigs", "frames") if (folder / f"{name}{suffix}").exists()]
-    if len(there) == 1:
-        missing = "frames" if there == ["rigs"] else "rigs"
+    present = [name for name in ("rigs", "frames") if (folder / f"{name}{suffix}").exists()]
+    if len(present) == 1:
+        missing = "frames" if present == ["rigs"] else "rigs"
         raise InputError(
-            f"{folder} has {there[0]}{suffix} but no {missing}{suffix}; add it, or remove {there[0]}{suffix}"
+            f"{folder} has {present[0]}{suffix} but no {missing}{suffix}; add it, or remove "
+            f"{present[0]}{suffix}"
         )
     if suffix == ".bin":
         return read_files(ModelFiles(folder, str(folder), suffix))
@@ -321,7 +322,6 @@ def _read_images(files: ModelFiles, camera_ids: set[int]) -> _Images:
 
 
 def _read_rigs(files: ModelFiles, camera_ids: set[int]) -> dict[int, RigRecord]:
-    """Read rigs.bin; rigs by their ids."""
     file, rigs = files.open("rigs"), dict[int, RigRecord]()
     for _ in range(file.take_count(RIG.size, "rigs")):
         rig_id, num_sensors = map(int, file.take(RIG, "a rig"))
@@ -430,13 +430,15 @@ def _with_points(files: ModelFiles, model: ModelArrays) -> ModelArrays:
         is_there &= elements[:, 1] < np.append(np.diff(model.starts), 0)[rows]
         if not is_there.all():
             image_id, keypoint = elements[~is_there][0].tolist()
-            said = f"a track refers to point {keypoint} of image {image_id}"
-            raise ContradictionError(f"{called}: {said}, which {files.beside('images')} does not have")
+            reference = f"a track refers to point {keypoint} of image {image_id}"
+            raise ContradictionError(f"{called}: {reference}, which {files.beside('images')} does not have")
         other = _observe(model, heads, model.starts[rows] + elements[:, 1])
         if other and not contradiction:
             k, point, owner = other
-            said = f"the track of 3D point {point} has keypoint {elements[k, 1]} of image {elements[k, 0]}"
-            contradiction = f"{called}: {said}, to which {files.beside('images')} gives 3D point {owner}"
+            reference = (
+                f"the track of 3D point {point} has keypoint {elements[k, 1]} of image {elements[k, 0]}"
+            )
+            contradiction = f"{called}: {reference}, to which {files.beside('images')} gives 3D point {owner}"
     _refuse_unknown_points(files, model)
     if contradiction:
         raise ContradictionError(contradiction)
@@ -484,7 +486,6 @@ def _observe(model: ModelArrays, heads: Records, places: IntArray) -> tuple[int,
 
 
 def _ascending(points: Records, tracks: UInt32Array) -> tuple[Records, UInt32Array]:
-    """Return points by their ids, with their tracks."""
     order = np.argsort(points["id"], kind="stable")
     if (np.diff(order) == 1).all():
         return points, tracks
@@ -496,7 +497,6 @@ def _ascending(points: Records, tracks: UInt32Array) -> tuple[Records, UInt32Arr
 
 
 def _refuse_unknown_points(files: ModelFiles, model: ModelArrays) -> None:
-    """Refuse observations of points that are not there."""
     ids, point_ids = model.points2d["point3d_id"], np.append(model.points["id"], NO_POINT)
     for begin in range(0, len(ids), model_arrays.AT_ONCE):
         some = ids[begin : begin + model_arrays.AT_ONCE]
@@ -512,7 +512,6 @@ def _refuse_unknown_points(files: ModelFiles, model: ModelArrays) -> None:
 
 @inner_kernel
 def _read_u64(data: npt.NDArray[np.uint8], offset: int) -> np.uint64:
-    """Return the little-endian uint64 at `offset`."""
     value = np.uint64(0)
     for k in range(8):
         value |= np.uint64(data[offset + k]) << np.uint64(8 * k)

@@ -69,9 +69,9 @@ def arrays_of(reconstruction: pycolmap.Reconstruction) -> tuple[ModelArrays, tup
         for frame_id in unposed:
             reconstruction.frame(frame_id).rig_from_world = pycolmap.Rigid3d()
             reconstruction.register_frame(frame_id)
-        with private_folder() as own, quiet_log():
-            reconstruction.write_binary(own)
-            model, notes = read_files(ModelFiles(own, called, ""))
+        with private_folder() as folder, quiet_log():
+            reconstruction.write_binary(folder)
+            model, notes = read_files(ModelFiles(folder, called, ""))
     except PYCOLMAP_ERRORS as error:
         raise InputError(f"{called} is not a sound COLMAP model: {_first_line(error)}") from error
     poses = np.where(np.isin(model.frames.ids, unposed)[:, None], np.nan, model.frames.poses)
@@ -99,10 +99,10 @@ def reconstruction_of(model: ModelArrays) -> pycolmap.Reconstruction:
     """
     unposed = ~model.frames.is_posed
     poses = np.where(unposed[:, None], ORIGIN, model.frames.poses)
-    with private_folder() as own, quiet_log():
-        write_binary(replace(model, frames=model.frames._replace(poses=poses)), own)
+    with private_folder() as folder, quiet_log():
+        write_binary(replace(model, frames=model.frames._replace(poses=poses)), folder)
         try:
-            built = pycolmap.Reconstruction(own)
+            built = pycolmap.Reconstruction(folder)
         except PYCOLMAP_ERRORS as error:
             raise InputError(f"pycolmap refuses the model: {_first_line(error)}") from error
     for frame_id in model.frames.ids[unposed].tolist():

@@ -69,9 +69,9 @@ class SeededModel:
             keypoints: for matches of a database to refer to; None: those of the template.
         """
         keypoints = keypoints or (lambda _: None)
-        own = tuple(_narrowed(keypoints(k)) for k in range(images.num_images))
+        pixels = tuple(_narrowed(keypoints(k)) for k in range(images.num_images))
         colors, bare = np.zeros((points.num_points, 3), dtype=np.uint8), replace(template, colors=None)
-        seed = cls(template=bare, images=images, points=points, colors=colors, keypoints=own)
+        seed = cls(template=bare, images=images, points=points, colors=colors, keypoints=pixels)
         return replace(seed, colors=color_points(points, images.ids.tolist(), seed._pixels, template.colors))
 
     @cached_property
@@ -176,7 +176,6 @@ class SeededModel:
         return heads
 
     def _blocks(self) -> Iterator[tuple[Records, UInt32Array]]:
-        """Yield points and their tracks, some at a time."""
         points = self.points
         for first in range(0, points.num_points, AT_ONCE):
             rows = np.arange(first, min(first + AT_ONCE, points.num_points))

@@ -72,10 +72,10 @@ def database_in(path: Path) -> Path:
     """
     if not path.is_dir():
         return path
-    found = database_beside(path)
-    if found is None:
+    beside = database_beside(path)
+    if beside is None:
         raise InputError(f"{path} is a folder without a {DATABASE_NAMES[0]}; give the database file itself")
-    return found
+    return beside
 
 
 def database_beside(folder: Path) -> Path | None:
@@ -263,7 +263,7 @@ def _private_copy(path: Path, stack: ExitStack) -> Path:
     """Copy a database with its -wal or -journal, and try again if a writer changed them meanwhile."""
     files = [path, *_sidecars(path)]
     for _ in range(_COPY_ATTEMPTS):
-        before, folder = [_fingerprint(file) for file in files], stack.enter_context(private_folder())
+        fingerprints, folder = [_fingerprint(file) for file in files], stack.enter_context(private_folder())
         try:
             for file in filter(Path.exists, files):
                 shutil.copyfile(file, folder / file.name)
@@ -272,6 +272,6 @@ def _private_copy(path: Path, stack: ExitStack) -> Path:
                 f"the database {path} has unfinished changes and cannot be copied to a temporary folder "
                 f"({error.strerror}); close the program that uses it, or make room"
             ) from None
-        if before == [_fingerprint(file) for file in files]:
+        if fingerprints == [_fingerprint(file) for file in files]:
             return folder / path.name
     raise InputError(f"the database {path} is being written by another program; wait until it is done")

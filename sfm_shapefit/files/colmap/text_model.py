@@ -48,8 +48,6 @@ _TWO_LINES = "each image has two lines, its own and that of its points, which ma
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """One line of a text file, with its place for messages."""
-
     path: Path
     number: int
     text: str
@@ -190,7 +188,6 @@ def _images(lines: Iterator[_Line], notes: list[str]) -> Iterator[bytes]:
 
 
 def _image_head(line: _Line) -> bytes:
-    """Return the record of an image up to its name."""
     words = line.text.split(None, 9)
     if len(words) < 10:
         raise line.fault(f"expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME: {_TWO_LINES}")
@@ -268,7 +265,6 @@ def _frames(lines: Iterator[_Line]) -> Iterator[bytes]:
 
 
 def _taken(line: _Line, words: Iterator[str], count: int) -> list[str]:
-    """Return the next words of a line."""
     some = list(itertools.islice(words, count))
     if len(some) < count:
         raise line.fault("the line ends too early; write it again")

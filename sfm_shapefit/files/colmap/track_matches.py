@@ -12,14 +12,7 @@ from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
-from sfm_shapefit.scene.matches import (
-    PLENTY,
-    Matches,
-    PairNames,
-    Reading,
-    View,
-    batch_ranges,
-)
+from sfm_shapefit.scene.matches import PLENTY, Matches, PairNames, Reading, View, batch_ranges
 from sfm_shapefit.scene.points import Points
 
 
@@ -91,8 +84,8 @@ class TrackMatches(Matches):
         for first, last in batch_ranges(sizes, PLENTY.batch):
             left, right = self._pair_up(np.arange(first, last))
             of_pair = self._codes(self._image_of[left], self._image_of[right])
-            for found, parts in zip(np.unique(of_pair, return_counts=True), (codes, counts), strict=True):
-                parts.append(found)
+            for counted, parts in zip(np.unique(of_pair, return_counts=True), (codes, counts), strict=True):
+                parts.append(counted)
         pairs = np.stack(np.divmod(np.concatenate(codes), len(self.names)), axis=1)
         return pairs, np.concatenate(counts)
 
@@ -103,7 +96,7 @@ class TrackMatches(Matches):
     def _pair_up(self, images: IntArray) -> tuple[IntArray, IntArray]:
         """Return the observations of the images, and with each in turn those of its point that follow."""
         bounds = zip(self._starts[images].tolist(), self._starts[images + 1].tolist(), strict=True)
-        own = np.concatenate([self._by_image[:0], *(self._by_image[a:b] for a, b in bounds)])
-        follows = self._following[own]
-        left = np.repeat(own, follows)
+        observations = np.concatenate([self._by_image[:0], *(self._by_image[a:b] for a, b in bounds)])
+        follows = self._following[observations]
+        left = np.repeat(observations, follows)
         return left, left + 1 + np.arange(len(left)) - np.repeat(np.cumsum(follows) - follows, follows)

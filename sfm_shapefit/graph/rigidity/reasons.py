@@ -60,5 +60,4 @@ def _hinges_of(camera: int, home: int, pieces: list[RigidPiece], placed: BoolArr
 
 
 def _name(graph: ViewGraph, camera: int) -> str:
-    """Return the name of a node for a sentence."""
     return graph.name_of(camera) if graph.names else f"camera {camera}"

@@ -1,87 +1,34 @@
-"""Rigs and fixed cameras in `locate`: which images form rigid groups, and how these are placed.
-
-The frames of a model with rigs are groups with metric offsets. Cameras that are fixed stand where the input
-has them: two or more are one group, whose offsets are their centers; of a single one only the origin can be
-taken.
-"""
+"""Place cameras: 3D points and tracks take part where they hold what pairs do not."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, hand_back_memory
+from sfm_shapefit.base.arrays import hand_back_memory
 from sfm_shapefit.base.blas_threads import one_blas_thread
-from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.facts.options import FIX_SOLVED, PlacingOptions
-from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.lines import text_of
-from sfm_shapefit.graph.groups import RigidGroups, separate
+from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.judgement.verdicts import Hold, find_hold
 from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES
-from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.measure import Measured, add_evidence, build_graph
-from sfm_shapefit.placement.gauge import coincide
-from sfm_shapefit.placement.place import Near, Placement, place_pieces
+from sfm_shapefit.pipeline.measure import add_evidence, build_graph
+from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged
+from sfm_shapefit.placement.place import InitialPlacement, Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.same_images import same_images
+from sfm_shapefit.solver.options import reported
 from sfm_shapefit.solver.tied import largest_tied
 from sfm_shapefit.tracks.options import NodeOptions
 
 _FITTING = 0.95  # share of pairs that agree with a placement; from here on no other is tried
 _MOST_TRIED = 5_000  # nodes; more take seconds
 
-Place = Callable[..., Iterator[Placement]]
-
-
-class Rigid(NamedTuple):
-    """What of a model is rigid."""
-
-    fixed: BoolArray
-    """(n,) images that stay exactly where the input has them."""
-    groups: RigidGroups | None
-    """The images in groups; None where each moves by itself."""
-    fixed_group: int | None
-    """The group of the fixed images."""
-
-    @property
-    def has_scale(self) -> bool:
-        """Whether images of a group stand apart, so that pairs that see two of them tell a scale."""
-        return self.groups is not None and self.groups.have_extent
-
-    def apply(self, measured: MeasuredGraph) -> MeasuredGraph:
-        """Return a measured graph of the images with these groups; each of its points is one more."""
-        if self.groups is None:
-            return measured
-        groups = self.groups.with_separate(measured.num_points)
-        return replace(measured, groups=groups, fixed_group=self.fixed_group)
-
-
-def find_rigid_parts(images: Images, fixed: BoolArray | None = None) -> Rigid:
-    """Return what moves together and what not at all: the frames of rigs, and `fixed` images (n,).
-
-    Raises:
-        InputError: if the fixed images stand at one place.
-    """
-    fixed = np.zeros(images.num_images, dtype=np.bool_) if fixed is None else fixed
-    count = int(np.sum(fixed))
-    if not images.has_rigs and count < 2:
-        return Rigid(fixed, None, None)
-    frames = RigidGroups(group_of=images.frame_of, offsets=images.offsets)
-    groups = frames if images.has_rigs else separate(images.num_images, 3)
-    if count == 0:
-        return Rigid(fixed, groups, None)
-    if count > 1 and not images.has_rigs and coincide(images.centers[fixed]):
-        raise InputError(
-            f"the {count} fixed cameras stand at one place in the input; fix others, whose positions it has"
-        )
-    return Rigid(fixed, groups.with_fixed(fixed, images.centers), 0)
+PlacesGraph = Callable[..., Iterator[Placement]]
 
 
 def rigs_statement(images: Images, measured: MeasuredGraph) -> str:
@@ -102,7 +49,7 @@ def place_cameras(
     options: PlacementOptions,
     nodes: NodeOptions,
     clock: Clock,
-    near: Near | None = None,
+    near: InitialPlacement | None = None,
     *,
     certified: bool = True,
 ) -> Iterator[Placement]:
@@ -113,7 +60,7 @@ def place_cameras(
     """
     hand_back_memory()  # what the graph was made of is gone
     placed = partial(
-        place_pieces, options=options, near=near, certified=certified, on_iteration=clock.iteration
+        place_pieces, options=options, near=near, certified=certified, on_iteration=reported(clock.advance)
     )
     if not measured.has_scale or not measured.num_points or nodes.points == "always":
         yield from placed(measured)
@@ -137,7 +84,7 @@ def may_be_checked(measured: MeasuredGraph) -> bool:
 
 
 def place_by_checked(
-    usual: Placement, checked: Callable[[], MeasuredGraph], place: Place
+    usual: Placement, checked: Callable[[], MeasuredGraph], place: PlacesGraph
 ) -> tuple[MeasuredGraph, Placement] | None:
     """Return the graph with the points of checked tracks, and its placement, if more pairs agree with that.
 
@@ -157,7 +104,7 @@ def place_by_checked(
 
 
 def place_measured(
-    images: Images, graph: MeasuredGraph, measured: Measured, nodes: NodeOptions, place: Place
+    images: Images, graph: MeasuredGraph, measured: MeasuredPairs, nodes: NodeOptions, place: PlacesGraph
 ) -> list[Placement]:
     """Return the pieces of a graph, or of that with checked points where more pairs agree with these.
 
@@ -173,7 +120,7 @@ def place_measured(
 
 
 def place_first(
-    images: Images, rigid: Rigid, measured: Measured, options: PlacingOptions, clock: Clock
+    images: Images, rigid: FixedAndRigged, measured: MeasuredPairs, options: PlacingOptions, clock: Clock
 ) -> Placement:
     """Return the largest piece of what was measured, by locations that are only a start."""
     build = partial(build_graph, images, measured, options.nodes)
@@ -207,47 +154,3 @@ def measure_hold(placement: Placement, max_bytes: int = DEFAULT_FACTOR_BYTES) ->
     hand_back_memory()  # what the solve took
     part, refined = placement.measured_part(), placement.refined
     return find_hold(part, refined.locations, placement.agreement, refined.reset_nodes, max_bytes)
-
-
-def read_fixed_images(model: ColmapModel, fix: str) -> BoolArray:
-    """Return which images (n,) are to stay where they are.
-
-    Raises:
-        InputError: if the file of their names cannot be read, a name is unknown, or nothing is left to place.
-    """
-    if not fix:
-        return np.zeros(model.images.num_images, dtype=np.bool_)
-    fixed = _solved_images(model) if fix == FIX_SOLVED else _named_images(model, Path(fix))
-    if not model.images.is_posed[fixed].all():
-        raise InputError("the position of a fixed camera is not known (NaN); fix others, whose position is")
-    if fixed.all():
-        raise InputError(
-            "every posed image of the model would be fixed, so that none is left to place; name fewer, "
-            "or give the new images rotations first"
-        )
-    return fixed
-
-
-def _solved_images(model: ColmapModel) -> BoolArray:
-    """Return which images (n,) observe a 3D point."""
-    rows = model.arrays.images.rows(model.images.ids).tolist()
-    solved = np.array([len(model.arrays.observed(row)[0]) > 0 for row in rows], dtype=np.bool_)
-    if not solved.any():
-        raise InputError("no image of the model observes a 3D point, so none is solved; name those to fix")
-    return solved
-
-
-def _named_images(model: ColmapModel, path: Path) -> BoolArray:
-    """Return which images (n,) a file names, one a line."""
-    fixed = np.zeros(model.images.num_images, dtype=np.bool_)
-    lines = [(n, line.strip()) for n, line in enumerate(text_of(path).splitlines(), start=1)]
-    listed = [(number, name) for number, name in lines if name and not name.startswith("#")]
-    places, ambiguity = same_images([name for _, name in listed], model.images.names)
-    for (number, name), place in zip(listed, places.tolist(), strict=True):
-        if place < 0:
-            why = ambiguity or "give one name per line"
-            raise InputError(f"{path}, line {number}: the model has no posed image {name!r}; {why}")
-        fixed[place] = True
-    if not fixed.any():
-        raise InputError(f"{path} names no image; give the name of one image per line")
-    return fixed

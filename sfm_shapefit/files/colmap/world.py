@@ -6,8 +6,6 @@ reprojection errors; `World.bend_statement` says how far its cameras then stand 
 """
 
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +14,6 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, nearest_rotations
 from sfm_shapefit.files.colmap.earth import epsg_code, to_epsg
 from sfm_shapefit.files.lines import is_number
-from sfm_shapefit.pipeline.evaluate import model_datum
 from sfm_shapefit.scene.given import Datum
 from sfm_shapefit.scene.images import Images
 
@@ -92,11 +89,11 @@ class World:
         )
 
 
-def world_of(source: Any, centers: FloatArray, crs: str, offset: str) -> World:
+def world_of(datum: Datum | None, centers: FloatArray, crs: str, offset: str) -> World:
     """Return the world in which a model is to be written.
 
     Args:
-        source: the model, a folder or a result, that may have a datum.
+        datum: that of the model; None without.
         centers: (k, 3) of its cameras.
         crs: a system as of `epsg_code`; empty for the model's own axes.
         offset: three numbers with commas between them, or auto: the cameras' middle in round numbers.
@@ -106,12 +103,10 @@ def world_of(source: Any, centers: FloatArray, crs: str, offset: str) -> World:
     """
     world = World()
     if crs:
-        datum = model_datum(source)
         if datum is None:
-            label = source if isinstance(source, Path | str) else "the model"
             raise InputError(
-                f"{label} has no datum, so that nothing says where on Earth it stands; convert the output of "
-                "locate or map with --priors or --control-points of known latitude and longitude"
+                "the model has no datum, so that nothing says where on Earth it stands; convert the output "
+                "of locate or map with --priors or --control-points of known latitude and longitude"
             )
         world = World(datum=datum, code=epsg_code(crs, datum))
     if offset == "auto":

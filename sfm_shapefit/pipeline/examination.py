@@ -1,7 +1,6 @@
 """Ask for evidence that the fit did not use: of our own models, and of any that is looked at."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +8,7 @@ from sfm_shapefit.adjustment.lens_doubts import excess
 from sfm_shapefit.adjustment.open_shape import estimate_open_shape
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.lenses import is_bogus
@@ -23,31 +23,18 @@ from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, find_hanging,
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.witnesses import are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.state import ModelState
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import View
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 from sfm_shapefit.tracks.links import ObservedTracks
 
 _OPEN = 1e100  # squared units; larger covariances overflow, and mean that nothing holds a camera
 _MOST_ASKED = 200  # images of a lens that are left out; each takes 1.4 ms, and a median of so many is exact
-
-
-class Structure(NamedTuple):
-    """The points of a model, and what they are seen with."""
-
-    points: Points
-    images: Images
-    """Images where the model has them; NaN where it does not."""
-    pictures: Pictures
-    among: BoolArray | None = None
-    """(i,) images that make the points; all if None."""
-    asked: BoolArray | None = None
-    """(i,) images that are asked whether they contradict their lenses; all if None."""
 
 
 def gather_evidence(
@@ -79,14 +66,16 @@ def gather_evidence(
     asked_of = [one.camera for one in contradicted]
     asked_of += [] if source.has_database else [one.camera for one in places]
     doubted = np.isin(np.arange(images.num_images), asked_of)
-    sure = ask_pixels(source, structure, doubted)  # own tracks hold no second place of who fits the first
+    confirmed = ask_pixels(
+        source, structure, doubted
+    )  # own tracks hold no second place of who fits the first
     num_unasked = int(np.sum(source.view.num_keypoints == 0)) if source.inputs.is_made else 0
     return ModelEvidence(
         lenses=lenses,
         oddities=odd,
-        places=tuple(one for one in places if source.has_database or not sure[one.camera]),
+        places=tuple(one for one in places if source.has_database or not confirmed[one.camera]),
         seams=seams,
-        contradicted=tuple(one for one in contradicted if not sure[one.camera]),
+        contradicted=tuple(one for one in contradicted if not confirmed[one.camera]),
         untied=tuple(one for one in untied if 2 * np.isin(one.cameras, apart).sum() < len(one.cameras)),
         num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)) + num_unasked,
         sides=(int(fits.agrees.sum()), int(fits.contradicts.sum())),
@@ -126,10 +115,10 @@ def confirm_by_pixels(state: ModelState) -> BoolArray:
 
 def with_left_out(state: ModelState) -> Images:
     """Return the delivered images, and where they are placed those that were left out."""
-    before, now = state.placed().frames.centers, state.images.frames.centers
-    there = np.isfinite(before).all(axis=1) & np.isfinite(now).all(axis=1)
-    motion = fit_similarity(before[there], now[there])
-    placed = np.where(np.isfinite(now), now, motion.apply(before))
+    placed_centers, now = state.placed().frames.centers, state.images.frames.centers
+    common = np.isfinite(placed_centers).all(axis=1) & np.isfinite(now).all(axis=1)
+    motion = fit_similarity(placed_centers[common], now[common])
+    placed = np.where(np.isfinite(now), now, motion.apply(placed_centers))
     return state.images.posed(state.images.frames.rotations, placed)
 
 
@@ -175,17 +164,19 @@ def ask_shape(
     if not isinstance(tracks, ObservedTracks) or len(rows) < SMALLEST_SHAPE:
         return None
     held = {"lenses_held": lenses_held, "rotations_held": rotations_held}
-    if all(held.values()):
-        return None
-    found = estimate_open_shape(images.part(rows), tracks, **held, threads=threads)
-    return None if found is None else OpenShape.of(images, rows, found)
+    shape = (
+        None
+        if all(held.values())
+        else estimate_open_shape(images.part(rows), tracks, **held, threads=threads)
+    )
+    return None if shape is None else OpenShape.of(images, rows, shape)
 
 
 def open_beyond_noise(state: ModelState, shape: OpenShape) -> FloatArray:
     """Return the covariances (k, 3, 3) that a shape leaves open beyond its noise, in the solver's unit."""
     judged, scale = state.judged, state.gauge.similarity.scale
-    told = np.clip(judged.covariances, -_OPEN, _OPEN)  # a camera that hangs loose has huge ones
-    return excess(shape.covariances[judged.cameras] / scale**2, told)
+    known = np.clip(judged.covariances, -_OPEN, _OPEN)  # a camera that hangs loose has huge ones
+    return excess(shape.covariances[judged.cameras] / scale**2, known)
 
 
 def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:
@@ -263,7 +254,7 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
     hanging = find_hanging(len(group), rays, holding, together)
     groups = (*groups, *(one for one in hanging if not np.isin(one.cameras, named).any()))
     rows = (np.flatnonzero(np.isin(frames, one.cameras) & images.is_posed) for one in groups)
-    return of, tuple(one._replace(cameras=own) for one, own in zip(groups, rows, strict=True))
+    return of, tuple(one._replace(cameras=cameras) for one, cameras in zip(groups, rows, strict=True))
 
 
 def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray) -> BoolArray:
@@ -288,12 +279,12 @@ def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray
         same = (ends[:, 0] == ends[:, 1]) & fitting[keypoints].all(axis=1)
         apart = (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])
         rows = np.flatnonzero(apart)
-        for own in (0, 1):  # the point of either end, where the other has its keypoint
+        for end in (0, 1):  # the point of either end, where the other has its keypoint
             one = Points(
-                xyz=points.xyz[ends[rows, own]],
+                xyz=points.xyz[ends[rows, end]],
                 offsets=np.arange(len(rows) + 1),
-                images=seen_by[rows, 1 - own],
-                keypoints=batch.keypoints[rows, 1 - own],
+                images=seen_by[rows, 1 - end],
+                keypoints=batch.keypoints[rows, 1 - end],
                 ids=rows,
             )
             rows = rows[keypoint_errors_px(one, images, structure.pictures) <= FITTING_PX]

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from sfm_shapefit.base.arrays import begin_run, hand_back_memory
-from sfm_shapefit.solver.options import IterationInfo, SolverOptions
+from sfm_shapefit.base.threads import count_threads
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of a stage, the work done so far and the work in all."""
@@ -22,16 +22,14 @@ class Clock:
     stage: str = ""
     executor: Executor | None = None
     """Shares out pairs among its workers; None: all is done in this process."""
-    threads: int = field(default_factory=SolverOptions().num_threads)
+    threads: int = field(default_factory=count_threads)
     """Threads of this process."""
 
     @classmethod
-    def of(
-        cls, progress: Progress | None, options: SolverOptions, executor: Executor | None = None
-    ) -> "Clock":
-        """Return the clock of a run whose caller may want to hear of its progress."""
+    def of(cls, progress: Progress | None, threads: int = 0, executor: Executor | None = None) -> "Clock":
+        """Begin a run whose caller may want to hear of its progress; 0 threads are one per core."""
         begin_run()
-        clock = cls(executor=executor, threads=options.num_threads())
+        clock = cls(executor=executor, threads=count_threads(threads))
         clock.progress = progress or clock.progress
         return clock
 
@@ -55,7 +53,3 @@ class Clock:
     def advance(self, done: int, total: int) -> None:
         """Report progress inside the current stage."""
         self.progress(self.stage, done, total)
-
-    def iteration(self, info: IterationInfo) -> None:
-        """Report an iteration of the solver: of at most so many, for fewer may do."""
-        self.progress(self.stage, info.iteration, max(info.limit, info.iteration))

@@ -4,7 +4,6 @@ Directions of pairs are placed with the rotations that are given. What is left t
 once, and rotations that the matches know better than whoever gave them.
 """
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,19 +13,18 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.adjustment.sources import links_touching
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
-from sfm_shapefit.facts.options import Rotations
+from sfm_shapefit.base.geometry import normalized, tangent_bases, turned_deg
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
-from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.state import ModelState
+from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.scene.images import Images
@@ -41,13 +39,6 @@ _SAID_OF_MATCHES = (
 )
 
 
-def pull_of_rotations(rotations: Rotations) -> float | None:
-    """Return by which standard deviation given rotations pull, see `Freedom`; None: as the matches say."""
-    if not isinstance(rotations, str):
-        return math.radians(rotations)
-    return {"auto": None, "held": 0.0, "free": math.inf}[rotations]
-
-
 def pull_cameras(state: ModelState) -> ModelState:
     """Return the cameras pulled by the priors that have set the gauge, which holds from here on.
 
@@ -56,7 +47,8 @@ def pull_cameras(state: ModelState) -> ModelState:
     known = state.inputs.known
     if known.priors is None or known.control is not None or state.frame.scale != "prior":
         return state
-    priors, limited = known.priors.with_sigmas(), state.source.economy.limit(state.inputs.options.placement)
+    priors, options = known.priors.with_sigmas(), state.inputs.options.placement
+    limited = state.source.memory_plan.limit(options)
     if not len(priors.of(state.placement.cameras)) or state.frame.axes is None:
         return state
     try:
@@ -98,7 +90,7 @@ def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
         turns = source.images.rotations.transpose(0, 2, 1) @ images.rotations
         turned = _turn(placement.measured, directions, turns)
         if adjusted.refines_sensors:  # which stand elsewhere in their frames now
-            turned = find_rigid_parts(source.images, state.rigid.fixed).apply(turned)
+            turned = find_fixed_and_rigged(source.images, state.rigid.fixed).apply(turned)
         placement = replace(placement, measured=turned)
     return replace(
         state,
@@ -115,14 +107,14 @@ def with_uncertainty(placement: Judged, images: Images, known: Estimate, scale: 
     """Return the placement with what an adjustment knows of its errors, `scale` to the solver's unit."""
     if known.covariances is None:
         return placement
-    own = np.full((len(placement.cameras), 3, 3), np.nan)
-    _, rows, there = np.intersect1d(
+    covariances = np.full((len(placement.cameras), 3, 3), np.nan)
+    _, rows, known_rows = np.intersect1d(
         images.ids[placement.cameras], known.images.ids, assume_unique=True, return_indices=True
     )
-    own[rows] = known.covariances[there] / scale**2
+    covariances[rows] = known.covariances[known_rows] / scale**2
     return replace(
         placement,
-        adjusted_covariances=own,
+        adjusted_covariances=covariances,
         lens_errors=known.lens_errors,
         scale_sigma=placement.scale_sigma if known.scale_sigma is None else known.scale_sigma,
     )
@@ -130,27 +122,27 @@ def with_uncertainty(placement: Judged, images: Images, known: Estimate, scale: 
 
 def _measure_again(
     source: MatchSource,
-    before: PairDirections,
+    earlier: PairDirections,
     corrected: BoolArray,
     options: DirectionOptions,
     clock: Clock,
 ) -> PairDirections:
-    """Return the usable directions as they are at other rotations; the others, and what is said, stay.
+    """Return directions with the usable ones measured at other rotations; unusable ones stay as they are.
 
-    Images whose rotations were clearly wrong, and are `corrected`, get what their matches say now.
+    The other columns stay, too, but for pairs of `corrected` images, whose rotations were clearly wrong.
     """
-    usable = before.usable()
-    used = before.pairs[usable]
+    usable = earlier.usable()
+    used = earlier.pairs[usable]
     others = source.view.pairs[~is_among(source.view.pairs, used)]
     batches = source.view.batches(without=others, advance=clock.advance)
     again = concatenate([estimate_directions(batch, options, clock.threads) for batch in batches])
     rows = again.usable()
     is_anew = corrected[again.pairs[rows]].any(axis=1)
     taken = {"directions": rows, **dict.fromkeys(_SAID_OF_MATCHES, rows[is_anew])}
-    merged = {name: getattr(before, name).copy() for name in taken}
+    merged = {name: getattr(earlier, name).copy() for name in taken}
     for name, chosen in taken.items():
         merged[name][usable[chosen]] = getattr(again, name)[chosen]
-    return replace(before, **merged)
+    return replace(earlier, **merged)
 
 
 def _turn(measured: MeasuredGraph, directions: PairDirections, turns: FloatArray) -> MeasuredGraph:
@@ -171,9 +163,3 @@ def _turn(measured: MeasuredGraph, directions: PairDirections, turns: FloatArray
         evidence = replace(evidence, errors=evidence.errors @ bases.transpose(0, 2, 1))
     turned = ViewGraph(graph.num_nodes, graph.edges, normalized(new), graph.weights, graph.names)
     return replace(measured, graph=turned, covariance=covariance, evidence=evidence)
-
-
-def turned_deg(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return by how many degrees rotations (n, 3, 3) turned, exactly 0 where they kept their bits."""
-    same = (before == after).all(axis=(1, 2))
-    return np.where(same, 0.0, rotation_angles_deg(after.transpose(0, 2, 1) @ before))

@@ -147,9 +147,9 @@ def bundle_adjust(
     model = reconstruction.reconstruction if hasattr(reconstruction, "reconstruction") else reconstruction
     read, _ = arrays_of(model)
     images, points, tracks = read_bundle(read)
-    found = TriangulatedPoints.of_tracks(tracks, points.xyz)
+    triangulated = TriangulatedPoints.of_tracks(tracks, points.xyz)
     views, given = views_of(images), GivenPoses(fixed=np.isin(images.frames.ids, sorted(fixed_frames)))
-    problem = views.problem(images, np.zeros(len(images.lenses), np.bool_), given, tracks, found)
+    problem = views.problem(images, np.zeros(len(images.lenses), np.bool_), given, tracks, triangulated)
     if rotation_sigma_deg is not None:
         sigmas = np.full(problem.num_frames, np.radians(rotation_sigma_deg))
         prior = RotationPrior(rotations=problem.rotations, information=isotropic_information(sigmas))

@@ -1,0 +1,127 @@
+"""Read what the user knows of images beside their matches: positions, distances, gravity, who stays."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.options import FIX_SOLVED, Rotations
+from sfm_shapefit.files.colmap.control_points import read_control_points
+from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
+from sfm_shapefit.files.colmap.model import ColmapModel
+from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.files.lines import text_of
+from sfm_shapefit.placement.options import GaugeOptions
+from sfm_shapefit.rotations.options import GRAVITY_OF_DATABASE
+from sfm_shapefit.scene.given import ControlPoints, Gravity, Known, PositionPriors
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import names_among, same_images
+
+PRIORS_OF_DATABASE = "database"
+"""In place of a table or folder: the database's own pose priors."""
+
+
+def read_known(
+    images: Images,
+    file: DatabaseFile | None,
+    priors: Path | str | None = None,
+    control_points: str = "",
+    gravity: str = "",
+) -> Known:
+    """Return what the user tells of images: position priors, control points, gravity, as far as asked for."""
+    return Known(
+        priors=None if priors is None else _read_priors(images, file, priors),
+        control=_read_control(images, control_points) if control_points else None,
+        gravity=_read_gravity(images, file, gravity) if gravity else None,
+    )
+
+
+def _read_priors(images: Images, file: DatabaseFile | None, source: Path | str) -> PositionPriors:
+    if str(source) == PRIORS_OF_DATABASE:
+        if file is None:
+            raise InputError("there is no database whose priors could be taken; give one (database=FILE)")
+        return database_priors(file, images)
+    return exif_priors(Path(source), images) if Path(source).is_dir() else table_priors(Path(source), images)
+
+
+def _read_control(images: Images, file: str) -> ControlPoints:
+    known = read_control_points(Path(file), images)
+    if reason := known.why_too_few():
+        raise InputError(f"{file}: {reason}")
+    return known
+
+
+def _read_gravity(images: Images, file: DatabaseFile | None, source: str) -> Gravity:
+    if source != GRAVITY_OF_DATABASE:
+        return table_gravity(Path(source), images)
+    if file is None:
+        raise InputError("there is no database whose gravity could be taken; give a table")
+    return database_gravity(file, images)
+
+
+def between_images(gauge: GaugeOptions, names: Sequence[str], missing: str) -> GaugeOptions:
+    """Return options whose known distances are between images of some names.
+
+    Raises:
+        InputError: if one is of an image that there is not; `missing` says so, but for its name.
+    """
+    named, ambiguity = names_among((name for one in gauge.known_distance for name in one[:2]), names)
+    for name in (name for one in gauge.known_distance for name in one[:2]):
+        if name not in named:
+            raise InputError(f"known distances: {missing} {name}{ambiguity and f'; {ambiguity}'}")
+    known = tuple((named[first], named[second], length) for first, second, length in gauge.known_distance)
+    return replace(gauge, known_distance=known)
+
+
+def pull_of_rotations(rotations: Rotations) -> float | None:
+    """Return by which standard deviation given rotations pull, see `Freedom`; None: as the matches say."""
+    if not isinstance(rotations, str):
+        return math.radians(rotations)
+    return {"auto": None, "held": 0.0, "free": math.inf}[rotations]
+
+
+def read_fixed_images(model: ColmapModel, fix: str) -> BoolArray:
+    """Return which images (n,) are to stay where they are.
+
+    Raises:
+        InputError: if the file of their names cannot be read, a name is unknown, or nothing is left to place.
+    """
+    if not fix:
+        return np.zeros(model.images.num_images, dtype=np.bool_)
+    fixed = _solved_images(model) if fix == FIX_SOLVED else _named_images(model, Path(fix))
+    if not model.images.is_posed[fixed].all():
+        raise InputError("the position of a fixed camera is not known (NaN); fix others, whose position is")
+    if fixed.all():
+        raise InputError(
+            "every posed image of the model would be fixed, so that none is left to place; name fewer, "
+            "or give the new images rotations first"
+        )
+    return fixed
+
+
+def _solved_images(model: ColmapModel) -> BoolArray:
+    rows = model.arrays.images.rows(model.images.ids).tolist()
+    solved = np.array([len(model.arrays.observed(row)[0]) > 0 for row in rows], dtype=np.bool_)
+    if not solved.any():
+        raise InputError("no image of the model observes a 3D point, so none is solved; name those to fix")
+    return solved
+
+
+def _named_images(model: ColmapModel, path: Path) -> BoolArray:
+    fixed = np.zeros(model.images.num_images, dtype=np.bool_)
+    lines = [(n, line.strip()) for n, line in enumerate(text_of(path).splitlines(), start=1)]
+    listed = [(number, name) for number, name in lines if name and not name.startswith("#")]
+    places, ambiguity = same_images([name for _, name in listed], model.images.names)
+    for (number, name), place in zip(listed, places.tolist(), strict=True):
+        if place < 0:
+            why = ambiguity or "give one name per line"
+            raise InputError(f"{path}, line {number}: the model has no posed image {name!r}; {why}")
+        fixed[place] = True
+    if not fixed.any():
+        raise InputError(f"{path} names no image; give the name of one image per line")
+    return fixed

@@ -1,0 +1,273 @@
+"""Joins of models: judged by what ties their pieces, carried out group by group, and the joined model judged.
+
+pieces and ties -> votes, program, refinement, judgement (`placement.join`)
+    -> position priors where these are not enough -> groups merged -> judged as `check` does
+
+Nothing is placed anew. What the models know of their own cameras is kept, see `facts.joined`.
+"""
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
+from sfm_shapefit.facts.joined_cameras import JoinedGroup, joined_camera_rows, joined_verdict
+from sfm_shapefit.facts.joins import Joined
+from sfm_shapefit.facts.map_result import JoinedModel
+from sfm_shapefit.facts.model import EarthDatum, JoinedFacts
+from sfm_shapefit.facts.placed import UNITS, KeyFigures
+from sfm_shapefit.facts.result import Inputs, LocateResult
+from sfm_shapefit.facts.scene import told_distances
+from sfm_shapefit.files.colmap.merge import merge_models
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.reconstructions import name_of, transform_model
+from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
+from sfm_shapefit.pipeline.referee import check_source
+from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.gauge_rule import gauge_of_distances
+from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
+from sfm_shapefit.placement.options import KnownDistance
+from sfm_shapefit.placement.prior_join import PlacedByPriors, join_by_priors, place_by_priors
+from sfm_shapefit.scene.given import PositionPriors
+
+_SIGMA_OF = (
+    "joined: what the models know of their cameras, and how well the joins are known; relative to the mean "
+    "position and scale of the first"
+)
+# What says how large a model is; another scale has no meaning beside that of a known distance.
+_ARBITRARY = ("unit", "input")
+_SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
+
+
+class JoinInputs(NamedTuple):
+    """What is known of joined models beside the models."""
+
+    joins: Sequence[Joined]
+    """What came of joining each model to another."""
+    options: Mapping[str, Any]
+    inputs: Inputs
+    """Where matches come from."""
+    distances: Sequence[KnownDistance] = ()
+    located: Mapping[int, LocateResult] = MappingProxyType({})
+    """The models by number, as far as they are ours, with what is known of their cameras."""
+    notes: Sequence[str] = ()
+    """What was read otherwise than it stands in the models."""
+
+
+def judge_joins(
+    pieces: Sequence[ModelPiece], tied: TiedPieces, priors: Sequence[PositionPriors | None] = ()
+) -> Iterator[Joined]:
+    """Yield what comes of joining each piece but the first: by pairs, or else by `priors` of its cameras."""
+    outcomes = join_pieces(tied.cameras, tied.ties)
+    usable = [] if tied.cameras.is_metric.any() else priors
+    placed = [_on_priors(tied.cameras.centers_of(k), one) for k, one in enumerate(usable)]
+    for number in range(1, len(pieces)):
+        done = outcomes[number]
+        if placed and (not isinstance(done, PieceJoin) or done.reason):
+            other = _join_by_priors(number, placed)
+            done = other if isinstance(other, PieceJoin) or done == UNTIED else done
+        join = _at_known_scale(pieces, done) if isinstance(done, PieceJoin) else None
+        to = 0 if join is None else join.to
+        pairs = [] if join is None else tied.ties.matches.pairs[join.rivals].tolist()
+        yield Joined(
+            model=number,
+            to=to,
+            found=join,
+            reason=str(done) if join is None else join.reason,
+            labels=(pieces[number].label, pieces[to].label),
+            rivals=tuple((tied.names[v], tied.names[w]) for v, w in pairs),
+        )
+
+
+def _at_known_scale(pieces: Sequence[ModelPiece], join: PieceJoin) -> PieceJoin:
+    """Return a join with the errors of scales that rigs have; refused where only one model has rigs."""
+    two = pieces[join.to], pieces[join.piece]
+    if not any(one.model.images.has_rigs for one in two):
+        return join
+    if not all(one.model.images.has_rigs for one in two):
+        return replace(join, reason="only one of them has rigs of several cameras, and a scale by that")
+    if not all(one.is_metric for one in two):
+        return replace(join, reason="their rigs do not tell the scale of both")
+    sigma = float(np.linalg.norm([one.scale_sigma or 0.0 for one in two]))
+    # Errors of the size of the second model move its cameras about their middle.
+    center_sigma = float(np.hypot(join.center_sigma, sigma * median_spread(two[1].model.images.centers)))
+    return replace(join, scale_sigma=sigma, center_sigma=center_sigma)
+
+
+def _on_priors(centers: FloatArray, priors: PositionPriors | None) -> PlacedByPriors | str:
+    """Return a piece on the position priors of its cameras, or why it is not placed by them."""
+    try:
+        return UNTIED if priors is None else place_by_priors(centers, priors)
+    except UnsolvableError as error:
+        return str(error)
+
+
+def _join_by_priors(number: int, placed: Sequence[PlacedByPriors | str]) -> PieceJoin | str:
+    """Return the join of a piece to the first of the earlier ones that priors allow, or why there is none."""
+    piece, reasons = placed[number], list[str]()
+    for to, other in enumerate(placed[:number]):
+        if isinstance(piece, str) or isinstance(other, str):
+            reasons.append(piece if isinstance(piece, str) else str(other))
+            continue
+        try:
+            return join_by_priors((to, other), (number, piece))
+        except UnsolvableError as error:
+            reasons.append(str(error))
+    return next((reason for reason in reasons if reason != UNTIED), UNTIED)
+
+
+def merge_groups(
+    pieces: Sequence[ModelPiece], tied: TiedPieces, joins: Sequence[Joined]
+) -> list[JoinedGroup]:
+    """Return the pieces that were joined, each group in the world of its first."""
+    growing: dict[int, _Growing] = {}
+    root = list(range(len(pieces)))
+    for done in joins:
+        if done.join is not None:
+            first = root[done.model] = root[done.to]
+            group = growing[first] = growing.get(first) or _Growing(pieces[first], first)
+            group.add(done, pieces[done.model], tied)
+    return [growing[number].group for number in sorted(growing)]
+
+
+class _Growing:
+    """A group of joined pieces as it grows, and the ids that its points have."""
+
+    def __init__(self, piece: ModelPiece, number: int) -> None:
+        reconstruction = piece.model.reconstruction
+        same = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
+        self.group = JoinedGroup(reconstruction, {number: same}, ())
+        self.ids: dict[int, Mapping[int, int]] = {number: {i: i for i in reconstruction.point3D_ids()}}
+        """New ids of each piece's points, by the old ones."""
+
+    def add(self, done: Joined, piece: ModelPiece, tied: TiedPieces) -> None:
+        """Take in a piece that was joined to one of the group."""
+        assert done.join is not None
+        world_from = compose(self.group.world_from[done.to], done.join.to_from_piece)
+        worlds = {**self.group.world_from, done.model: world_from}
+        same = self._same_points(done.join, worlds, tied)
+        ours, theirs = self.group.reconstruction, piece.model.reconstruction
+        merged, renamed, new = merge_models(ours, theirs, world_from, same)
+        for number, ids in self.ids.items():
+            self.ids[number] = {point: renamed.get(now, now) for point, now in ids.items()}
+        self.ids[done.model] = new
+        ends = [np.flatnonzero(tied.cameras.piece_of == k)[:2] for k in (done.model, done.to)]
+        names = dict.fromkeys(tied.names[v] for v in np.concatenate(ends).tolist())
+        known = (*self.group.tied, *itertools.combinations(names, 2))
+        self.group = JoinedGroup(merged, worlds, (*self.group.joins, done), known)
+
+    def _same_points(
+        self, join: PieceJoin, worlds: Mapping[int, Similarity], tied: TiedPieces
+    ) -> list[tuple[int, int]]:
+        """Return points of the group and of a new piece that are one by the pairs that agree; each once."""
+        pieces = tied.cameras.piece_of[tied.ties.matches.pairs]
+        same: dict[int, int] = {}
+        for pair in join.agreeing.tolist():
+            way = int(pieces[pair, 1] == join.piece)
+            other = int(pieces[pair, 1 - way])
+            if other not in self.ids:
+                continue
+            rows, fits = _fitting(tied, pair, worlds)
+            for ids in tied.keypoints[rows][fits].tolist():
+                one = self.ids[other].get(ids[1 - way])
+                if one is not None and ids[way] >= 0 and one not in same.values():
+                    same.setdefault(ids[way], one)
+        return [(one, other) for other, one in same.items()]
+
+
+def _fitting(tied: TiedPieces, pair: int, worlds: Mapping[int, Similarity]) -> tuple[slice, BoolArray]:
+    """Return the matches of a pair, and which of them see, from each side, the point of the other side."""
+    ties = tied.ties.matches
+    rows = slice(*ties.offsets[pair : pair + 2].tolist())
+    off, ends = np.zeros(rows.stop - rows.start), ties.pairs[pair].tolist()
+    end_worlds = [worlds[int(tied.cameras.piece_of[v])] for v in ends]
+    for way, rays in enumerate((ties.rays_i[rows], ties.rays_j[rows])):
+        seen = end_worlds[1 - way].apply(tied.ties.points[rows, 1 - way])
+        eye = end_worlds[way].apply(tied.cameras.centers[ends[way]][None])
+        looks = rays @ tied.cameras.rotations[ends[way]] @ end_worlds[way].rotation.T
+        off = np.maximum(off, angle_between(seen - eye, looks))
+    return rows, np.asarray(off <= AGREEING_PX * ties.pixel_angles[pair])
+
+
+def tell_group(
+    group: JoinedGroup, join_inputs: JoinInputs, source: MatchSource, options: DirectionOptions, clock: Clock
+) -> JoinedModel:
+    """Return joined models with what can be said of them; `source` has the matches of their images."""
+    first, located = next(iter(group.world_from)), join_inputs.located
+    labels = {
+        k: label for one in group.joins for k, label in zip((one.model, one.to), one.labels, strict=True)
+    }
+    folder = f"joined_{first}" if located else "."
+    gauge = Gauge(scale="input", similarity=_SAME, statement="input: those of the first model")
+    if first in located:
+        gauge, group = _choose_scale(group, located[first].gauge, join_inputs.distances)
+    model = read_model(group.reconstruction)
+    rows = {name: k for k, name in enumerate(model.images.names)}
+    tied = np.array([(rows[a], rows[b]) for a, b in group.tied], dtype=np.int64).reshape(-1, 2)
+    source = replace(source.at(model.images), tied=tied)
+    checked = check_source(model, source, options, clock)
+    seen, measures = checked.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
+    cameras = list(joined_camera_rows(checked.cameras, group, located))
+    facts = JoinedFacts.taken_from(
+        seen,
+        inputs=join_inputs.inputs.facts,
+        options=dict(join_inputs.options),
+        verdict=joined_verdict(seen.verdict, group, located),
+        models=[labels[number].removeprefix("model ") for number in group.world_from],
+        joins=[one.facts(folder if one.join and one.model in labels else None) for one in join_inputs.joins],
+        num_images=len(cameras),
+        num_placed=group.reconstruction.num_reg_images(),
+        figures=KeyFigures.of_cameras(cameras, seen.figures.pair_error_deg, *measures),
+        sigma_of=_SIGMA_OF if located else "",
+        scale=gauge.statement,
+        scale_sigma=gauge.scale_sigma,
+        known_distances=told_distances(join_inputs.distances, model.images),
+        datum=EarthDatum.of(gauge.datum),
+        timings_s=clock.seconds,
+        warnings=[*join_inputs.notes, *seen.warnings, *filter(None, [gauge.warning])],
+    )
+    return JoinedModel(
+        reconstruction=group.reconstruction,
+        models=tuple(group.world_from),
+        joins=tuple(join_inputs.joins),
+        cameras=cameras,
+        pairs=checked.pairs,
+        facts=facts,
+    )
+
+
+def _choose_scale(
+    group: JoinedGroup, first: Gauge, known: Sequence[KnownDistance]
+) -> tuple[Gauge, JoinedGroup]:
+    """Return the gauge of joined models, and the models in it.
+
+    A scale that the first model knows stays. An arbitrary scale gives way to known distances, within a model
+    or between two.
+    """
+    number = next(iter(group.world_from))
+    placed = {name_of(image): image for image in group.reconstruction.images.values() if image.has_pose}
+    distances = [one for one in known if {*one[:2]} <= placed.keys()]
+    warning = ""
+    if first.scale in _ARBITRARY and distances:
+        centers = np.array([image.projection_center() for image in placed.values()])
+        try:
+            gauge = gauge_of_distances(list(placed), centers, distances)
+        except InputError as error:  # two cameras stand in one place
+            warning = str(error)
+        else:
+            world = group.world_from.items()
+            return gauge, group._replace(
+                reconstruction=transform_model(group.reconstruction, gauge.similarity),
+                world_from={number: compose(gauge.similarity, one) for number, one in world},
+            )
+    statement = f"that of model {number}: {first.statement}"
+    return replace(first, statement=statement, warning=warning), group

@@ -1,0 +1,20 @@
+"""The points of a model with the images that see them."""
+
+from typing import NamedTuple
+
+from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.points import Points
+
+
+class Structure(NamedTuple):
+    """The points of a model, and what they are seen with."""
+
+    points: Points
+    images: Images
+    """Images where the model has them; NaN where it does not."""
+    pictures: Pictures
+    among: BoolArray | None = None
+    """(i,) images that make the points; all if None."""
+    asked: BoolArray | None = None
+    """(i,) images that are asked whether they contradict their lenses; all if None."""
