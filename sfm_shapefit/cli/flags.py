@@ -14,6 +14,7 @@ from typer.core import TyperCommand
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import S, Settings, hint, homes_of, option, setting_groups
+from sfm_shapefit.cli.colmap_names import answer_for
 from sfm_shapefit.cli.console import flag_names, key_names
 from sfm_shapefit.cli.root import convert_plainly
 
@@ -176,13 +177,15 @@ class GroupedCommand(TyperCommand):
         if _HELP_ALL in args and not ctx.resilient_parsing:
             ctx.meta[_ALL_OPTIONS] = True
             args = ["--help"]
-        known = {name for parameter in self.get_params(ctx) for name in parameter.opts}
+        parameters = self.get_params(ctx)
+        known = {name for one in parameters for name in (*one.opts, *one.secondary_opts)}
+        args = _with_hyphens(args, known)
         flag_names.update(name.removeprefix("--").replace("-", "_") for name in known)
         if not ctx.resilient_parsing:
             self._refuse_unknown(ctx, args, known)
         if "--database" in known:
             ctx.allow_extra_args = True  # so that they can be looked at
-        convert_plainly(self.get_params(ctx))
+        convert_plainly(parameters)
         try:
             extra = super().parse_args(ctx, _gather_values(args))
         except typer.BadParameter as error:
@@ -207,6 +210,20 @@ class GroupedCommand(TyperCommand):
                 ctx.fail(f"{flag} is a key of --config: {name} = ...")
             if others := _commands_with(name):
                 ctx.fail(f"{flag} is an option of {others}")
+            if answer := answer_for(flag, known):
+                ctx.fail(answer)
+
+
+def _with_hyphens(args: Sequence[str], known: set[str]) -> list[str]:
+    """Return arguments with flags as they are known, where underscores stand in the place of hyphens."""
+    flags = itertools.takewhile(lambda word: word != "--", args)
+    spelled = []
+    for word in flags:
+        flag, equals, value = word.partition("=")
+        hyphened = flag.replace("_", "-")
+        is_typed = flag.startswith("--") and flag not in known and hyphened in known
+        spelled.append(f"{hyphened}{equals}{value}" if is_typed else word)
+    return [*spelled, *args[len(spelled) :]]
 
 
 def _bare(name: str) -> str:

@@ -103,6 +103,7 @@ def write_converted(
 ) -> Converted:
     """Write a model in another format, in a system and with an offset; `convert` raises the same."""
     # Here, so that the command line knows the formats without loading pycolmap.
+    from sfm_shapefit.base.paths import refuse_absent
     from sfm_shapefit.files.colmap.listed_poses import read_by_itself
     from sfm_shapefit.files.colmap.model import model_of, read_model
     from sfm_shapefit.files.colmap.reconstructions import transform_model
@@ -112,7 +113,8 @@ def write_converted(
     name = target_format or _format_of(path)
     if name not in FORMATS:
         raise InputError(f"{name!r} is no format to write; give one of {', '.join(FORMATS)}")
-    protect = [source] if isinstance(source, Path | str) else []
+    protect = [Path(source)] if isinstance(source, Path | str) else []
+    refuse_absent(*protect)
     if name not in _FOLDERS:
         refuse_file(path, overwrite=overwrite, protect=protect)
     given, source = source, model_of(source)

@@ -1,0 +1,129 @@
+"""How far a run is, on stderr: one line that vanishes on a terminal, a line for each long stage elsewhere."""
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from sfm_shapefit.cli.console import say
+
+if TYPE_CHECKING:
+    from sfm_shapefit.pipeline.clock import Progress
+
+_PATIENCE_S = 10.0  # seconds without a terminal before the first line; shorter runs leave a log clean
+_AGAIN_S = 60.0  # seconds without a terminal between two lines on one stage
+_RATED_S = 1.0  # seconds of a stage before its rate is believed
+_BAR = 24  # columns
+_COMPILING = "compiling kernels, once"
+
+
+class Course:
+    """The stage that a run is in, how much of it is done, and when both began."""
+
+    __slots__ = ("began", "done", "first", "stage", "started", "total")
+
+    def __init__(self) -> None:
+        self.started = self.began = time.monotonic()
+        self.stage, self.first, self.done, self.total = "start", 0, 0, 1
+
+    def hear(self, stage: str, done: int, total: int) -> None:
+        """Take what a stage reports; work done before its first report, as of a resumed run, has no rate."""
+        if (stage, total) != (self.stage, self.total):
+            self.began, self.first = time.monotonic(), done
+        self.stage, self.done, self.total = stage, done, total
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the run began."""
+        return time.monotonic() - self.started
+
+    @property
+    def counts(self) -> str:
+        """How much of the stage is done, and how long its rest takes; empty if it does not count."""
+        if self.total <= 1:
+            return ""
+        spent, done = time.monotonic() - self.began, self.done - self.first
+        left = spent * (self.total - self.done) / done if done > 0 and spent >= _RATED_S else 0.0
+        about = f", about {_duration(left)} left" if left >= 1.0 else ""
+        return f"{self.done:,} of {self.total:,}{about}"
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    if not minutes:
+        return f"{rest} s"
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+@contextmanager
+def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | None]":
+    """Show on stderr how far a run is; yield what is told of it, None if nothing is to be shown.
+
+    On a terminal that is one line: stage, how much of it is done, how long its rest takes, and how long the
+    run has taken. It is gone at the end. Elsewhere, or `verbose`, since pycolmap's messages would break it,
+    stages get a line each: from the start if `verbose`, else those after the first seconds.
+    """
+    from sfm_shapefit.base.jit import on_compilation
+    from sfm_shapefit.pipeline.warm_up import compile_together
+
+    if not enabled:
+        with compile_together(_say_nothing, _say_nothing):
+            yield None
+        return
+    on_one_line = sys.stderr.isatty() and not verbose
+    with _one_line() if on_one_line else _lines(0.0 if verbose else _PATIENCE_S) as hear:
+        compiling = partial(hear, _COMPILING)
+        with on_compilation(partial(compiling, 0, 1)), compile_together(compiling, say):
+            yield hear
+
+
+def _say_nothing(*_what: Any) -> None:
+    """Tell nobody."""
+
+
+@contextmanager
+def _lines(patience_s: float) -> "Iterator[Progress]":
+    """Write a line where a stage begins, or is at work when the time comes, and another every minute."""
+    course, said, said_at = Course(), "", 0.0
+
+    def hear(stage: str, done: int, total: int) -> None:
+        nonlocal said, said_at
+        course.hear(stage, done, total)
+        if done == total:
+            said = said if total > 1 else ""  # a stage that comes again has a line again
+            return
+        seconds = course.seconds
+        if seconds >= patience_s and (stage != said or seconds - said_at >= _AGAIN_S):
+            said, said_at = stage, seconds
+            counts = f": {course.counts}" if course.counts else ""
+            say(f"{stage}{counts}" + (f"; {_duration(seconds)} so far" if seconds >= _PATIENCE_S else ""))
+
+    yield hear
+
+
+@contextmanager
+def _one_line() -> "Iterator[Progress]":
+    """Show a line that is drawn again and again, on a copy of stderr, which nobody silences."""
+    from rich.console import Console
+    from rich.live import Live
+    from rich.progress_bar import ProgressBar
+    from rich.table import Table
+
+    course = Course()
+
+    def draw() -> Table:
+        line = Table.grid(padding=(0, 1))
+        for _ in range(4):
+            line.add_column(no_wrap=True)
+        bar = ProgressBar(course.total, course.done, width=_BAR, pulse=course.total <= 1)
+        line.add_row(course.stage, bar, course.counts, f"({_duration(course.seconds)} so far)")
+        return line
+
+    with (
+        os.fdopen(os.dup(2), "w") as stream,
+        Live(get_renderable=draw, console=Console(file=stream), transient=True),
+    ):
+        yield course.hear
