@@ -341,20 +341,28 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
         typer.BadParameter: if it is no TOML, or an option is unknown or has a wrong value.
     """
     known = homes_of(settings)
-    values = _read_toml(config, settings) if config else {}
+    in_file = _read_toml(config, settings) if config else {}
     flags = {name: value for name, value in given.items() if value is not None and name in known}
     for name in _REPEATED.keys() & flags.keys():
         flags[name] = tuple(_values_of(name, text) for text in flags[name])
     flags |= {name: _word_or_number(flags[name]) for name in _WORDS_OR_NUMBERS & flags.keys()}
-    values |= flags
     try:
-        return settings(**values)
+        return settings(**in_file | flags)
     except (TypeError, ValueError) as error:
-        message = f"{config}: {error}" if config and isinstance(error, TypeError) else str(error)
+        message = f"{config}: {error}" if _is_wrong_alone(settings, in_file, str(error)) else str(error)
         for name in flags:  # an option of the file keeps its spelling
             message = re.sub(rf"\b{name}(?=[ =])", _flag_of(name), message)
             message = message.replace(f"{_flag_of(name)}=", f"{_flag_of(name)} ")
         raise typer.BadParameter(message) from error
+
+
+def _is_wrong_alone(settings: type[Settings], values: dict[str, Any], message: str) -> bool:
+    """Return whether the values of a file alone are refused in the same words."""
+    try:
+        settings(**values)
+    except (TypeError, ValueError) as error:
+        return str(error) == message
+    return False
 
 
 def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
@@ -371,7 +379,9 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
     homes = homes_of(settings)
     for name in read.keys() - {*homes, *homes.values()}:
-        raise typer.BadParameter(f"{path}: {name!r} {_describe_unknown(name, sorted(homes))}")
+        raise typer.BadParameter(
+            f"{path}: {name!r} {_describe_unknown(name, sorted({*homes, *homes.values()}))}"
+        )
     return read
 
 

@@ -130,7 +130,7 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
         raise InputError(f"{target} {what}, but OUT is a folder to be made; the order is {order}{first}")
 
 
-def _refuse_unreadable(order: str, inputs: Sequence[Path | None], *, has_images: bool) -> None:
+def _refuse_unreadable(order: str, inputs: Sequence[Path | None], has_images: bool) -> None:
     """Raise InputError if a database, images or models, with theirs after them, cannot be read."""
     from sfm_shapefit.files.colmap.listed_poses import read_source
     from sfm_shapefit.files.colmap.photographs import find_photographs
@@ -141,9 +141,8 @@ def _refuse_unreadable(order: str, inputs: Sequence[Path | None], *, has_images:
         find_photographs(first) if has_images else DatabaseFile(database_in(first)).close()
     elif order.startswith("MODEL"):
         *models, database = inputs[:2] if order == "MODEL OUT" else inputs
-        for model in models:
-            if model is not None:
-                read_source(model, database)
+        for model in filter(None, models):
+            read_source(model, database)
 
 
 @contextmanager

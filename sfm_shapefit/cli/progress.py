@@ -4,7 +4,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,16 +14,14 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.clock import Progress
 
 _PATIENCE_S = 10.0  # seconds without a terminal before the first line; shorter runs leave a log clean
+_APART_S = 5.0  # seconds without a terminal between lines; stages that are over sooner share one
 _AGAIN_S = 60.0  # seconds without a terminal between two lines on one stage
 _RATED_S = 1.0  # seconds of a stage before its rate is believed
 _BAR = 24  # columns
-_COMPILING = "compiling kernels, once"
 
 
-class Course:
+class _Course:
     """The stage that a run is in, how much of it is done, and when both began."""
-
-    __slots__ = ("began", "done", "first", "stage", "started", "total")
 
     def __init__(self) -> None:
         self.started = self.began = time.monotonic()
@@ -43,51 +41,45 @@ class Course:
     @property
     def counts(self) -> str:
         """How much of the stage is done, and how long its rest takes; empty if it does not count."""
-        if self.total <= 1:
-            return ""
         spent, done = time.monotonic() - self.began, self.done - self.first
         left = spent * (self.total - self.done) / done if done > 0 and spent >= _RATED_S else 0.0
         about = f", about {_duration(left)} left" if left >= 1.0 else ""
-        return f"{self.done:,} of {self.total:,}{about}"
+        return f"{self.done:,} of {self.total:,}{about}" if self.total > 1 else ""
 
 
 def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
-    if not minutes:
-        return f"{rest} s"
-    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+    if minutes >= 60:
+        return f"{minutes // 60} h {minutes % 60} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 @contextmanager
 def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | None]":
     """Show on stderr how far a run is; yield what is told of it, None if nothing is to be shown.
 
-    On a terminal that is one line: stage, how much of it is done, how long its rest takes, and how long the
-    run has taken. It is gone at the end. Elsewhere, or `verbose`, since pycolmap's messages would break it,
-    stages get a line each: from the start if `verbose`, else those after the first seconds.
+    On a terminal that is one line, gone at the end: stage, how much of it is done, how long its rest takes,
+    and how long the run has taken. Elsewhere, or `verbose`, since pycolmap's messages would break that line,
+    stages get a line each: from the start if `verbose`, else where they are at work after some seconds.
     """
     from sfm_shapefit.base.jit import on_compilation
     from sfm_shapefit.pipeline.warm_up import compile_together
 
-    if not enabled:
-        with compile_together(_say_nothing, _say_nothing):
-            yield None
-        return
-    on_one_line = sys.stderr.isatty() and not verbose
-    with _one_line() if on_one_line else _lines(0.0 if verbose else _PATIENCE_S) as hear:
-        compiling = partial(hear, _COMPILING)
-        with on_compilation(partial(compiling, 0, 1)), compile_together(compiling, say):
-            yield hear
+    lines = _tell_lines(0.0, 0.0) if verbose else _tell_lines(_PATIENCE_S, _APART_S)
+    on_one_line = enabled and sys.stderr.isatty() and not verbose
+    with _one_line() if on_one_line else nullcontext(lines if enabled else _tell_nobody) as hear:
+        compiling = partial(hear, "compiling kernels, once")
+        with on_compilation(partial(compiling, 0, 1)), compile_together(compiling, say if enabled else _tell_nobody):
+            yield hear if enabled else None
 
 
-def _say_nothing(*_what: Any) -> None:
-    """Tell nobody."""
+def _tell_nobody(*_what: Any) -> None:
+    pass
 
 
-@contextmanager
-def _lines(patience_s: float) -> "Iterator[Progress]":
-    """Write a line where a stage begins, or is at work when the time comes, and another every minute."""
-    course, said, said_at = Course(), "", 0.0
+def _tell_lines(patience_s: float, apart_s: float) -> "Progress":
+    """Return what writes a line where a stage begins, or is at work when its time comes, and every minute."""
+    course, said, said_at = _Course(), "", -apart_s
 
     def hear(stage: str, done: int, total: int) -> None:
         nonlocal said, said_at
@@ -96,12 +88,12 @@ def _lines(patience_s: float) -> "Iterator[Progress]":
             said = said if total > 1 else ""  # a stage that comes again has a line again
             return
         seconds = course.seconds
-        if seconds >= patience_s and (stage != said or seconds - said_at >= _AGAIN_S):
+        if seconds >= patience_s and seconds - said_at >= (_AGAIN_S if stage == said else apart_s):
             said, said_at = stage, seconds
             counts = f": {course.counts}" if course.counts else ""
             say(f"{stage}{counts}" + (f"; {_duration(seconds)} so far" if seconds >= _PATIENCE_S else ""))
 
-    yield hear
+    return hear
 
 
 @contextmanager
@@ -112,12 +104,12 @@ def _one_line() -> "Iterator[Progress]":
     from rich.progress_bar import ProgressBar
     from rich.table import Table
 
-    course = Course()
+    course = _Course()
 
     def draw() -> Table:
-        line = Table.grid(padding=(0, 1))
-        for _ in range(4):
-            line.add_column(no_wrap=True)
+        line = Table.grid(*[""] * 4, padding=(0, 1))
+        for column in line.columns:
+            column.no_wrap = True
         bar = ProgressBar(course.total, course.done, width=_BAR, pulse=course.total <= 1)
         line.add_row(course.stage, bar, course.counts, f"({_duration(course.seconds)} so far)")
         return line

@@ -192,7 +192,7 @@ def _compare(
     second = compare_models(images, fits, other.images, other.fits, other.doubted)
     if second is None:
         return None
-    grade = other.source.models[other.number].located.verdict.grade
+    grade = other.source.models[other.number].verdict.grade
     second = second._replace(grade=grade, folder=str(other.number))
     elsewhere = [*second.wrong, *second.undecided]
     if len(elsewhere) != 1:  # several that are wrong together see false points together

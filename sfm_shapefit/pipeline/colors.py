@@ -22,7 +22,7 @@ def has_colors(found: LocateResult | GraphResult | MapResult | JoinedModel) -> b
     """Return whether points of a result, of several models the largest, have colors; none need no color."""
     if isinstance(found, GraphResult):
         return True
-    shown = found.models[0].located if isinstance(found, MapResult) else found
+    shown = found.models[0] if isinstance(found, MapResult) else found
     picked = pick_points(shown.model if isinstance(shown, LocateResult) else shown.reconstruction, _PICKED)
     return not picked.num_all or bool(picked.colors.any())
 
@@ -57,7 +57,7 @@ def with_colors(found: Result, images: Path | str) -> Result:
 def _colored(found: Any, pictures: PictureFolder, unread: set[str]) -> Any:
     """Return a result with colors; names of unreadable pictures are added to `unread`."""
     if isinstance(found, MapResult):
-        models = [replace(one, located=_colored(one.located, pictures, unread)) for one in found.models]
+        models = [_colored(one, pictures, unread) for one in found.models]
         joined = [_colored(one, pictures, unread) for one in found.joined]
         return replace(found, models=tuple(models), joined=tuple(joined))
     if isinstance(found, JoinedModel):

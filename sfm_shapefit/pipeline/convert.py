@@ -60,7 +60,7 @@ def convert(
     overwrite: bool = False,
     crs: str = "",
     offset: str = "",
-) -> str:
+) -> Path:
     """Write the posed images of a model in another format.
 
     Args:
@@ -75,13 +75,13 @@ def convert(
             *_offset.xyz beside the file, in offset.xyz in a folder.
 
     Returns:
-        The format that was written.
+        The file or folder that was made; others stand beside it.
 
     Raises:
         InputError: if the source cannot be read, the format cannot hold it, the target exists already, or
             the model cannot be brought to the system.
     """
-    return write_converted(source, Path(target), target_format, overwrite, (crs, offset)).format
+    return write_converted(source, Path(target), target_format, overwrite, (crs, offset)).files[0]
 
 
 class Converted(NamedTuple):

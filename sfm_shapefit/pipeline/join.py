@@ -19,9 +19,9 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
 from sfm_shapefit.base.settings import flat_values, merge_options
 from sfm_shapefit.facts.joins import Joined
-from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
+from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.options import JoinOptions
-from sfm_shapefit.facts.result import Inputs
+from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model, renamed_as
@@ -311,7 +311,7 @@ def _fitting(tied: TiedPieces, pair: int, worlds: Mapping[int, Similarity]) -> t
 
 
 def join_mapped(
-    models: Sequence[MappedModel], run: MapRun
+    models: Sequence[LocateResult], run: MapRun
 ) -> tuple[tuple[Joined, ...], tuple[JoinedModel, ...], tuple[str, ...]]:
     """Join the models of a run, largest first, where that is safe and wanted.
 
@@ -321,7 +321,7 @@ def join_mapped(
     """
     if len(models) < 2 or run.options.join == "never":
         return (), (), ()
-    located = {number: model.located for number, model in enumerate(models)}
+    located = dict(enumerate(models))
     pieces = [
         ModelPiece(
             label=f"model {number}",

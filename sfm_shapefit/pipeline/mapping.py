@@ -17,7 +17,6 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
-from sfm_shapefit.facts.map_result import MappedModel
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.scene import Loop
@@ -333,12 +332,12 @@ def _place_first(inputs: RunInputs, source: MatchSource, clock: Clock) -> Estima
 
 def locate_components(
     run: MapRun, relative: RelativeRotations, visits: Sequence[Visit], reasons: dict[int, str]
-) -> list[MappedModel]:
+) -> list[LocateResult]:
     """Return a model of each component that can be placed, most cameras first.
 
     Why a frame belongs to none is written to `reasons`, which starts with one for each.
     """
-    models: list[MappedModel] = []
+    models: list[LocateResult] = []
     for frames, members, averaging in run.average_images(relative, reasons):
         try:
             located = _locate_component(run, members, averaging, relative)
@@ -346,29 +345,30 @@ def locate_components(
             reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
         names = tuple(run.images.names[k] for k in members.tolist())
-        located = replace(located, loops=tuple(_loops_of(visits, run.images.names, set(names))))
-        component = MappedModel(located=located, averaging=averaging, names=names)
-        models += _rigid_models(component, run.options.averaging.min_model_size)
+        loops = tuple(_loops_of(visits, run.images.names, set(names)))
+        found = replace(located, loops=loops, averaging=averaging, averaged_names=names)
+        models += _rigid_models(found, run.options.averaging.min_model_size)
         for k in frames.tolist():
             del reasons[k]
-    return sorted(models, key=lambda model: -int(model.located.kept.sum()))
+    return sorted(models, key=lambda model: -int(model.kept.sum()))
 
 
-def _rigid_models(component: MappedModel, least: int) -> Iterator[MappedModel]:
+def _rigid_models(first: LocateResult, least: int) -> Iterator[LocateResult]:
     """Yield the model of a component, and those of its further rigid pieces with so many cameras.
 
     The pairs between them tell no scale, but a join may, and `locate` of one cannot.
     """
-    first = component.located
+    averaging, names = first.averaging, first.averaged_names
+    assert averaging is not None
     large = [piece for piece in first.further if int(piece.kept.sum()) >= least]
     rest = tuple(piece for piece in first.further if piece not in large)
     there = np.any([piece.placed.is_posed for piece in (first, *large)], axis=0)
     first, *large = (replace(one, elsewhere=there & ~one.placed.is_posed) for one in (first, *large))
-    yield replace(component, located=replace(first, further=rest))
+    yield replace(first, further=rest)
     for piece in large:
         rows = np.sort(piece.placement.cameras)
-        names = tuple(component.names[k] for k in rows.tolist())
-        yield MappedModel(located=piece, averaging=component.averaging.subset(rows), names=names)
+        some = tuple(names[k] for k in rows.tolist())
+        yield replace(piece, averaging=averaging.subset(rows), averaged_names=some)
 
 
 def _locate_component(

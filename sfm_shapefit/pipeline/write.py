@@ -61,7 +61,7 @@ def write_result(
     *,
     options: WriteOptions | None = None,
     **overrides: Any,
-) -> None:
+) -> Path:
     """Write a result into a folder that appears whole or not at all: models, tables, a page for each.
 
     Args:
@@ -70,10 +70,14 @@ def write_result(
         options: settings, see `help(WriteOptions)`; defaults if None.
         **overrides: single options by name: `write_result(found, "out", overwrite=True)`.
 
+    Returns:
+        The folder.
+
     Raises:
         InputError: if the folder exists, cannot be written, or would hit a protected path.
     """
     deliver(found, out, merge_options(options, WriteOptions, overrides))
+    return Path(out)
 
 
 def deliver(found: Result, out: Path | str, options: WriteOptions) -> Result:
@@ -84,7 +88,7 @@ def deliver(found: Result, out: Path | str, options: WriteOptions) -> Result:
     kept = MADE_FIRST if made else ()
     with atomic_folder(out, overwrite=options.overwrite, protect=protect, kept=kept) as folder:
         if isinstance(found, MapResult):
-            models = {str(number): model.located for number, model in enumerate(found.models)}
+            models = {str(number): model for number, model in enumerate(found.models)}
             for name, one in (models | {joined.folder: joined for joined in found.joined}).items():
                 (folder / name).mkdir()
                 _write_files(one, folder / name, options)
@@ -145,8 +149,8 @@ def _write_cameras(rows: Sequence[CameraRow], dimension: int, folder: Path) -> N
 
 def write_page(
     found: Reported, page: Path | str, *, images: Path | str = "", overwrite: bool = False
-) -> None:
-    """Write the report of a result to a file; see `Reported.report`."""
+) -> Path:
+    """Write the report of a result to a file, and return it; see `Reported.report`."""
     refuse_file(
         Path(page), overwrite=overwrite, protect=[*_inputs_of(found), *([images] if str(images) else [])]
     )
@@ -154,6 +158,7 @@ def write_page(
         has_pictures = _write_report(found, partial, images)
     if not has_pictures:
         raise InputError(f"{images} has none of the images, so {page} has no pictures")
+    return Path(page)
 
 
 def refuse_file(page: Path, *, overwrite: bool, protect: Iterable[Path | str] = ()) -> None:
@@ -225,7 +230,7 @@ def _write_report(found: Any, page: Path, images: Path | str) -> bool:
     from sfm_shapefit.report.page import write_report
     from sfm_shapefit.report.thumbnails import read_thumbnails
 
-    shown = found.models[0].located if isinstance(found, MapResult) else found
+    shown = found.models[0] if isinstance(found, MapResult) else found
     drawing = _drawing_of(shown)
     cameras = drawing.cameras
     pictures = read_thumbnails(Path(images), cameras.names, cameras.trust) if str(images) else None

@@ -301,6 +301,20 @@ def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
     assert not (tmp_path / "out").exists()
 
 
+def test_what_is_wrong_in_a_config_file_is_said_with_its_name_and_tables_are_known_too(tmp_path):
+    config, flags = tmp_path / "options.toml", ("--config", tmp_path / "options.toml")
+    for text, words in (
+        ("min_trust = 'a'", "options.toml: min_trust must be a number"),
+        ("[direction]\nmin_inliers = 9", "'direction' is no option; did you mean directions?"),
+    ):
+        config.write_text(text)
+        said = run("locate", RING_MODEL, tmp_path / "out", *flags, code=2).stderr
+        assert words in " ".join(said.split())
+    config.write_text("min_trust = 0.5")
+    said = run("locate", RING_MODEL, tmp_path / "out", *flags, "--min-trust", "7", code=2).stderr
+    assert "options.toml: " not in said
+
+
 def test_a_config_file_sets_options_and_flags_win(tmp_path):
     text = 'scale = "unit"\n[directions]\nmin_inliers = 20\n[trust]\nmin_trust = 0.1\n'
     (tmp_path / "options.toml").write_text(text)

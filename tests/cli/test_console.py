@@ -118,7 +118,7 @@ def test_a_terminal_has_one_line_of_progress_with_what_is_left_and_nothing_of_it
 
 def test_without_a_terminal_a_short_run_says_nothing_and_a_long_one_a_line_for_each_stage(monkeypatch):
     assert run_python("-c", RUN.format(verbose=False, pause=0.0)).stderr == ""
-    long = RUN.replace("progress._RATED_S", "progress._PATIENCE_S = progress._RATED_S")
+    long = RUN.replace("progress._RATED_S", "progress._APART_S = progress._PATIENCE_S = progress._RATED_S")
     said = run_python("-c", long.format(verbose=False, pause=0.01)).stderr.splitlines()
     assert said == [f"sfm-shapefit: {stage}; 0 s so far" for stage in ("solve", "trust")]
     told = run_python("-c", RUN.format(verbose=True, pause=0.0)).stderr.splitlines()

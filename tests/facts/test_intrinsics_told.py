@@ -9,17 +9,21 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.facts.intrinsics import (
     CameraIntrinsics,
+    describe_change,
     describe_intrinsics,
     intrinsics_in_doubt,
     intrinsics_warnings,
 )
 from sfm_shapefit.scene.lens import Lens, Origin
 
+HEAD = "camera 1 (1.jpg and 3 more): focal length 1,000.0 px (a guess)"
+
 
 def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, num_images=4):
     """A row of locate.json."""
     return CameraIntrinsics(
         camera=camera,
+        image=f"{camera}.jpg",
         num_images=num_images,
         model="SIMPLE_RADIAL",
         origin=Origin.GUESS.value,
@@ -37,26 +41,27 @@ def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, 
     [
         (
             row(),
-            "camera 1: focal length 1,000.0 px (a guess) became 1,100.0 ± 5.0 px (+10.0%) by adjustment, "
-            "distortion -0.0500",
+            f"{HEAD} became 1,100.0 ± 5.0 px (+10.0%) by adjustment, distortion -0.0500",
         ),
         (
             row(decided_by="view graph", sigma=None),
-            "camera 1: focal length 1,000.0 px (a guess) became 1,100.0 px (+10.0%) by the view graph",
+            f"{HEAD} became 1,100.0 px (+10.0%) by the view graph",
         ),
         (
             row(decided_by="undetermined", found=1000.0, sigma=None),
-            "camera 1: focal length 1,000.0 px (a guess) kept, as the matches do not determine it",
+            f"{HEAD} kept, as the matches do not determine it",
         ),
         (
             replace(
                 row(decided_by="undetermined", found=1000.0, sigma=None),
                 parameters=[1000.0, 600.0, 450.0, -0.05],
             ),
-            "camera 1: focal length 1,000.0 px (a guess) kept, as the matches do not determine it, "
-            "distortion -0.0500",
+            f"{HEAD} kept, as the matches do not determine it, distortion -0.0500",
         ),
-        (row(decided_by="held", found=1000.0), "camera 1: focal length 1,000.0 px (a guess) kept"),
+        (
+            row(decided_by="held", found=1000.0),
+            f"{HEAD} kept",
+        ),
     ],
 )
 def test_each_of_few_cameras_is_told(one, sentence):
@@ -70,9 +75,9 @@ def test_many_cameras_are_told_in_one_sentence():
     rows += [row(9, "undetermined", found=1000.0), row(10, "held", found=1000.0)]
     (line,) = describe_intrinsics(rows)
     assert line == (
-        "3 of 5 cameras in doubt have another focal length now, by +10.0% to +30.0% (median +20.0%); 1 kept "
-        "the given one, as the matches do not determine it; 1 were not to be changed; each stands in "
-        "locate.json"
+        "3 of 5 cameras in doubt have another focal length now, by +10.0% to +30.0% (median +20.0%), most "
+        "that of camera 3 (3.jpg and 3 more); 1 kept the given one, as the matches do not determine it; 1 "
+        "were not to be changed; each stands in locate.json"
     )
 
 
@@ -108,12 +113,24 @@ def test_what_adjustments_leave_open_is_held_from_then_on_and_warned_of():
     rows = [row(1), row(2, "undetermined"), replace(row(3, "undetermined"), origin="given")]
     (warning,) = intrinsics_warnings(rows)  # what was calibrated needs none
     assert warning.startswith(
-        "camera 2 kept a focal length that was never measured, which the matches do not"
+        "camera 2 (2.jpg and 3 more) kept a focal length that was never measured, which the matches do not"
     )
 
 
 def test_cameras_whose_focal_length_is_hardly_known_are_named():
     rows = [row(1, sigma=10.0), row(2, sigma=12.0), row(3, sigma=None), row(4, "view graph", sigma=None)]
     (warning,) = intrinsics_warnings(rows)
-    assert warning.startswith("the matches hardly tell the focal length of cameras 2, 3 (± 1% or more), so")
+    assert warning.startswith(
+        "the matches hardly tell the focal length of camera 2 (2.jpg and 3 more), camera 3 (3.jpg and 3 "
+        "more) (± 1% or more), so"
+    )
     assert list(intrinsics_warnings([*rows[:1], replace(rows[1], origin="given")])) == []
+
+
+def test_lenses_that_changed_since_images_contradicted_them_are_one_line_with_names_of_files():
+    alone = row(num_images=1)
+    assert describe_change([alone]).startswith("camera 1 (1.jpg): focal length 1,000.0 px (a guess) became")
+    told = describe_change([alone, *(row(k, found=900.0) for k in range(2, 6))])
+    assert "5 cameras have another focal length" in told
+    assert "camera 1 (1.jpg) by +10.0%, camera 2 (2.jpg and 3 more) by -10.0%" in told
+    assert "and 2 more; each stands in locate.json" in told

@@ -53,7 +53,7 @@ def test_a_result_serves_wherever_a_model_does(tmp_path, ring_located, ring_mapp
     checked = sfm_shapefit.check(found, second_opinion=mapped)
     assert checked.facts.inputs.database == str(found.database)  # not the tracks, which agree more easily
     assert sfm_shapefit.inspect(found).num_images == 8
-    assert sfm_shapefit.convert(found, tmp_path / "poses.csv") == "csv"
+    assert sfm_shapefit.convert(found, tmp_path / "poses.csv") == tmp_path / "poses.csv"
     assert len(sfm_shapefit.bundle_adjust(found).frame_ids) == 8
     assert sfm_shapefit.locate(found).reconstruction.num_reg_images() == 8
     assert sfm_shapefit.evaluate(mapped, found).position.max < 1e-4

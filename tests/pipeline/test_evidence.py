@@ -55,7 +55,10 @@ def test_a_wrong_lens_that_is_held_is_named_with_the_right_focal_length():
     assert told.asked_focal_px == pytest.approx(right_px, rel=0.01)
     assert name in found.verdict.cameras
     assert found.verdict.grade is Grade.LOOK
-    assert sum(f"focal length of camera {wrong_id} is wrong" in warning for warning in found.warnings) == 1
+    assert (
+        sum(f"focal length of camera {wrong_id} ({name}) is wrong" in warning for warning in found.warnings)
+        == 1
+    )
     assert found.summary()["evidence"]["lenses"][0]["camera"] == wrong_id
 
 
@@ -125,11 +128,11 @@ def test_halves_that_two_pairs_tie_are_doubted_where_what_tied_them_was_rejected
     tmp_path, halves
 ):
     wrong = halves
-    (told,) = wrong.models[0].located.told_evidence.untied
+    (told,) = wrong.models[0].told_evidence.untied
     assert told.images == tuple(f"{k:04d}.jpg" for k in range(1, 13))
     assert (told.num_agreeing, told.num_points, told.is_loose) == (1, 0, True)
-    assert told.statement in wrong.models[0].located.warnings
-    unknown = {row.name for row in wrong.models[0].located.cameras if not np.isfinite(row.sigma).all()}
+    assert told.statement in wrong.models[0].warnings
+    unknown = {row.name for row in wrong.models[0].cameras if not np.isfinite(row.sigma).all()}
     assert unknown == set(told.images)
     assert wrong.verdict.grade is Grade.DO_NOT_USE
     right = sfm_shapefit.map_database(cut(tmp_path, (4, 25), (5, 24)))
@@ -186,7 +189,7 @@ def test_points_are_lost_that_only_a_pair_carries_whose_matches_mostly_see_two_p
 
 
 def test_halves_that_a_join_ties_are_not_doubted(halves):
-    model = read_model(halves.models[0].located.reconstruction)
+    model = read_model(halves.models[0].reconstruction)
     joined = np.flatnonzero(np.isin(model.images.ids, [1, 2, 13, 14]))
     clock = Clock.of(None, SolverOptions())
     with open_source(model, inputs_from(halves.database)) as source:
