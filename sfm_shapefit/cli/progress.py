@@ -69,7 +69,10 @@ def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | 
     on_one_line = enabled and sys.stderr.isatty() and not verbose
     with _one_line() if on_one_line else nullcontext(lines if enabled else _tell_nobody) as hear:
         compiling = partial(hear, "compiling kernels, once")
-        with on_compilation(partial(compiling, 0, 1)), compile_together(compiling, say if enabled else _tell_nobody):
+        with (
+            on_compilation(partial(compiling, 0, 1)),
+            compile_together(compiling, say if enabled else _tell_nobody),
+        ):
             yield hear if enabled else None
 
 

@@ -6,7 +6,7 @@ OUT/map.json        the averaging behind each, and the images in no model with t
 """
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,7 +25,7 @@ from sfm_shapefit.facts.model import (
 )
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Tabled
 from sfm_shapefit.judgement.grade import FEW_PLACED, in_another_model
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class JoinedModel(Written, Tabled):
+class JoinedModel(Written, Stated):
     """Models in one world, and the evidence for them together."""
 
     _PUBLIC = ("reconstruction", "models", "joins", "cameras", "pairs", "table", "warnings", "timings_s")
@@ -57,24 +57,9 @@ class JoinedModel(Written, Tabled):
         return f"joined_{self.models[0]}"
 
     @property
-    def verdict(self) -> ModelVerdict:
-        """Whether the joined model can be used, and why."""
-        return self.facts.verdict
-
-    @property
     def image_names(self) -> tuple[str, ...]:
         """Names of its images."""
         return tuple(row.name for row in self.cameras)
-
-    @property
-    def timings_s(self) -> Mapping[str, float]:
-        """Seconds of each stage."""
-        return self.facts.timings_s
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """What the user should know."""
-        return self.facts.warnings
 
     @property
     def told(self) -> Telling:

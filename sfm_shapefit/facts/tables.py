@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal, TextIO, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ import numpy.typing as npt
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.judgement.limits import KNOWN_DEG
+from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.judgement.verdicts import Verdict
 
 TableName = Literal["cameras", "pairs"]
@@ -229,6 +230,27 @@ class Tabled:
         if name not in _ROW_TYPES:
             raise ValueError(f"there is no table {name!r}; there are 'cameras' and 'pairs'")
         return columns_of(getattr(self, name), _ROW_TYPES[name], self.dimension)
+
+
+class Stated(Tabled):
+    """A result with rows that says of itself what its facts say."""
+
+    __slots__ = ()
+
+    @property
+    def verdict(self: Any) -> ModelVerdict:
+        """Whether the model can be used, and why."""
+        return cast(ModelVerdict, self.facts.verdict)
+
+    @property
+    def warnings(self: Any) -> Sequence[str]:
+        """What the user should know."""
+        return cast(Sequence[str], self.facts.warnings)
+
+    @property
+    def timings_s(self: Any) -> Mapping[str, float]:
+        """Seconds of each stage."""
+        return cast(Mapping[str, float], self.facts.timings_s)
 
 
 def columns_of(

@@ -33,7 +33,7 @@ from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
@@ -72,7 +72,7 @@ _ROUNDING = 1e-9  # share of the largest coordinate; cameras no farther apart st
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class CheckResult(Reported, Tabled):
+class CheckResult(Reported, Stated):
     """The verdict on a model, with the evidence for it."""
 
     model: ColmapModel
@@ -90,11 +90,6 @@ class CheckResult(Reported, Tabled):
     def reconstruction(self) -> "pycolmap.Reconstruction":
         """The model as read, so that the result serves as a model."""
         return self.model.reconstruction
-
-    @property
-    def verdict(self) -> ModelVerdict:
-        """Whether the model can be used, and why."""
-        return self.facts.verdict
 
     @cached_property
     def drawing(self) -> "Drawing":

@@ -378,6 +378,17 @@ def test_pairs_are_left_out_of_databases_only(tmp_path):
         sfm_shapefit.locate(RING / "sparse" / "0", directions="tracks", without=str(listed))
 
 
+@pytest.mark.parametrize("name", ["second/'||name", "clip_'||image_id||'.jpg'"])
+def test_a_folder_or_a_clip_none_of_whose_images_can_be_placed_is_one_line(tmp_path, name):
+    lost = " OR ".join(f"pair_id / {PAIR} = {k} OR pair_id % {PAIR} = {k}" for k in (6, 7, 8))
+    path = changed(RING, tmp_path, f"{PAIRS} {lost}")
+    edit_database(path, f"UPDATE images SET name = '{name} WHERE image_id >= 6")
+    place, first = ("second/", "second/0006.jpg") if "/" in name else ("clip_*.jpg", "clip_6.jpg")
+    said = run("map", path, tmp_path / "out", "--no-report", code=0).stdout
+    assert f"in no model: all 3 images of {place}, {first} for one: no matches: fewer than" in said
+    assert said.count("in no model:") == 1
+
+
 def told_under(found, label):
     """Return the lines that a terminal has under a label."""
     return [line for row in found.told.rows if row.label == label for line in row.lines]

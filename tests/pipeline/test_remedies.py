@@ -31,7 +31,9 @@ def test_a_lens_that_is_wrong_is_freed_and_the_cameras_stand_right(truth):
     name = truth.image(5).name
     found = sfm_shapefit.locate(with_own_lenses(truth, {name: 1.1}), DATABASE)
     assert found.verdict.grade is Grade.GOOD
-    assert any(f"camera {truth.image(5).image_id} ({name}): focal length" in warning for warning in found.warnings)
+    assert any(
+        f"camera {truth.image(5).image_id} ({name}): focal length" in warning for warning in found.warnings
+    )
     lens = found.reconstruction.find_image_with_name(name).camera
     assert lens.mean_focal_length() == pytest.approx(truth.image(5).camera.mean_focal_length(), rel=1e-3)
     assert sfm_shapefit.evaluate(found.reconstruction, truth).position.max < 1e-3
