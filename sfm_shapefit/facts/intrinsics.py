@@ -157,17 +157,6 @@ def label_lens(camera: int, image: str, num_images: int) -> str:
     return f"camera {camera} ({image}{f' and {num_images - 1:,} more' if num_images > 1 else ''})"
 
 
-def describe_change(rows: Sequence[CameraIntrinsics]) -> str:
-    """Say which cameras have another focal length, as their images contradicted what was given."""
-    if len(rows) == 1:
-        return f"{rows[0].statement}: its images contradicted what was given, unless --intrinsics held"
-    changes = first_of([f"{row.label} by {row.change:+.1%}" for row in rows])
-    return (
-        f"{len(rows)} cameras have another focal length, as their images contradicted what was given, unless "
-        f"--intrinsics held: {changes}; each stands in locate.json"
-    )
-
-
 def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
     """Return a sentence for each camera in doubt, most images first; of many, one for all."""
     if len(rows) <= _NAMED:

@@ -147,7 +147,7 @@ class _Placed(Written, Tabled):
     def not_placed(self: Any) -> dict[str, str]:
         """Name and reason of each camera that is placed neither here nor in another model of `map`."""
         elsewhere = getattr(self, "elsewhere", None)
-        others = () if elsewhere is None else np.array(self.images.names)[elsewhere].tolist()
+        others = set() if elsewhere is None else {*np.array(self.images.names)[elsewhere].tolist()}
         left_out = (row for row in self.cameras if not row.placed and row.name not in others)
         return {row.name: row.reason for row in left_out}
 
@@ -172,15 +172,7 @@ class LocateResult(_Placed):
 
     _PUBLIC = (
         *("reconstruction", "cameras", "pairs", "table", "warnings", "database", "options", "timings_s"),
-        *(
-            "gauge",
-            "intrinsics",
-            "rigs",
-            "control_points",
-            "further",
-            "certified",
-            "adjustment",
-        ),
+        *("gauge", "intrinsics", "rigs", "control_points", "further", "certified", "adjustment"),
     )
     seed: ModelInArrays
     """The output, as `reconstruction` and `write` have it."""

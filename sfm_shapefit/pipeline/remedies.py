@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.facts.intrinsics import describe_change
+from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.judgement.wrong_lenses import is_like_others
@@ -55,7 +55,9 @@ class Remedy(NamedTuple):
         found = replace(found, intrinsics=replace(found.intrinsics, focal_sigmas=sigmas))
         ids = {found.placed.lenses[row].id for row in self.freed}
         lenses = [row for row in found.intrinsics.rows(found.placed) if row.camera in ids]
-        done = [describe_change(lenses)] if lenses else []
+        changed = "; ".join(describe_intrinsics(lenses))
+        why = "images contradicted what was given, unless --intrinsics held"
+        done = [f"{changed}: {why}"] if lenses else []
         if self.moved:
             done.append(f"{', '.join(self.moved)}: placed without the pairs that twice as many contradict")
         return replace(found, warnings=(*done, *found.warnings))

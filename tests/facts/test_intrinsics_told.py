@@ -9,7 +9,6 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.facts.intrinsics import (
     CameraIntrinsics,
-    describe_change,
     describe_intrinsics,
     intrinsics_in_doubt,
     intrinsics_warnings,
@@ -125,12 +124,3 @@ def test_cameras_whose_focal_length_is_hardly_known_are_named():
         "more) (± 1% or more), so"
     )
     assert list(intrinsics_warnings([*rows[:1], replace(rows[1], origin="given")])) == []
-
-
-def test_lenses_that_changed_since_images_contradicted_them_are_one_line_with_names_of_files():
-    alone = row(num_images=1)
-    assert describe_change([alone]).startswith("camera 1 (1.jpg): focal length 1,000.0 px (a guess) became")
-    told = describe_change([alone, *(row(k, found=900.0) for k in range(2, 6))])
-    assert "5 cameras have another focal length" in told
-    assert "camera 1 (1.jpg) by +10.0%, camera 2 (2.jpg and 3 more) by -10.0%" in told
-    assert "and 2 more; each stands in locate.json" in told

@@ -224,3 +224,16 @@ def test_a_displaced_camera_has_its_other_place_with_both_counts(tmp_path, court
     assert told.num_there > 2 * told.num_here
     assert f"{told.num_there} put it 2" in told.statement
     assert image.name in facts.verdict.cameras
+
+
+def test_several_wrong_lenses_are_one_line_with_the_names_of_their_images():
+    truth = pycolmap.Reconstruction(COURTYARD / "truth")
+    names = [truth.image(truth_id).name for truth_id in sorted(truth.reg_image_ids())[5:15:9]]
+    given = with_own_lenses(truth, dict.fromkeys(names, 1.1))
+    held = sfm_shapefit.locate(given, COURTYARD / "database.db", intrinsics="held")
+    assert len(held.told_evidence.lenses) == 2
+    (line,) = (warning for warning in held.warnings if "focal length" in warning)
+    freed = sfm_shapefit.locate(given, COURTYARD / "database.db")
+    (changed,) = (warning for warning in freed.warnings if "focal length" in warning)
+    assert all(name in line and name in changed for name in names)
+    assert changed.count("images contradicted what was given") == 1
