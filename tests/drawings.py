@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_shapefit.facts.model import EvidenceShares, ModelFacts, ModelInputs
 from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece, Solve
-from sfm_shapefit.facts.tables import CameraRow, PairRow, PairScores
+from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.report.drawing import Poses, build_drawing
@@ -89,7 +89,7 @@ def _pair(e, names, centers, rng):
         direction=tuple(direction),
         support=support,
         residual_deg=float(rng.uniform(5, 160) if wrong else rng.lognormal(-2.5, 0.8)),
-        scores=PairScores(
+        scores=MethodScores(
             weight=weight, dual_norm=float(rng.uniform(0, 1)), leverage=float(rng.uniform(0, 0.9))
         ),
         verdict="undetermined" if undetermined else "outlier" if wrong else "inlier",

@@ -14,10 +14,9 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.clock import Progress
 
 _PATIENCE_S = 10.0  # seconds without a terminal before the first line; shorter runs leave a log clean
-_APART_S = 5.0  # seconds without a terminal between lines; stages that are over sooner share one
-_AGAIN_S = 60.0  # seconds without a terminal between two lines on one stage
-_RATED_S = 1.0  # seconds of a stage before its rate is believed
-_BAR = 24  # columns
+_AGAIN_S = 60.0  # seconds without a terminal between two lines on one stage; a log shows life by them
+_RATED_S = 1.0  # seconds of a stage before its rate is believed; what comes first loads what is needed
+_BAR = 24  # columns; beside it a stage and its counts fit 80
 
 
 class _Course:
@@ -55,17 +54,19 @@ def _duration(seconds: float) -> str:
 
 
 @contextmanager
-def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | None]":
+def show_progress(
+    enabled: bool, verbose: bool = False, patience_s: float = _PATIENCE_S
+) -> "Iterator[Progress | None]":
     """Show on stderr how far a run is; yield what is told of it, None if nothing is to be shown.
 
     On a terminal that is one line, gone at the end: stage, how much of it is done, how long its rest takes,
     and how long the run has taken. Elsewhere, or `verbose`, since pycolmap's messages would break that line,
-    stages get a line each: from the start if `verbose`, else where they are at work after some seconds.
+    stages get a line each: from the start if `verbose`, else where they are at work after `patience_s`.
     """
     from sfm_shapefit.base.jit import on_compilation
     from sfm_shapefit.pipeline.warm_up import compile_together
 
-    lines = _tell_lines(0.0, 0.0) if verbose else _tell_lines(_PATIENCE_S, _APART_S)
+    lines = _tell_lines(0.0 if verbose else patience_s)
     on_one_line = enabled and sys.stderr.isatty() and not verbose
     with _one_line() if on_one_line else nullcontext(lines if enabled else _tell_nobody) as hear:
         compiling = partial(hear, "compiling kernels, once")
@@ -80,9 +81,12 @@ def _tell_nobody(*_what: Any) -> None:
     pass
 
 
-def _tell_lines(patience_s: float, apart_s: float) -> "Progress":
-    """Return what writes a line where a stage begins, or is at work when its time comes, and every minute."""
-    course, said, said_at = _Course(), "", -apart_s
+def _tell_lines(patience_s: float) -> "Progress":
+    """Return what writes a line where a stage begins, or is at work when its time comes, and every minute.
+
+    Stages that are over in half of the patience share a line.
+    """
+    course, said, said_at = _Course(), "", -patience_s
 
     def hear(stage: str, done: int, total: int) -> None:
         nonlocal said, said_at
@@ -91,7 +95,7 @@ def _tell_lines(patience_s: float, apart_s: float) -> "Progress":
             said = said if total > 1 else ""  # a stage that comes again has a line again
             return
         seconds = course.seconds
-        if seconds >= patience_s and seconds - said_at >= (_AGAIN_S if stage == said else apart_s):
+        if seconds >= patience_s and seconds - said_at >= (_AGAIN_S if stage == said else patience_s / 2.0):
             said, said_at = stage, seconds
             counts = f": {course.counts}" if course.counts else ""
             say(f"{stage}{counts}" + (f"; {_duration(seconds)} so far" if seconds >= _PATIENCE_S else ""))

@@ -45,7 +45,7 @@ from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.scene import Loop, told_distances
-from sfm_shapefit.facts.tables import CameraRow, PairRow, PairScores, Tabled
+from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow, Tabled
 from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import (
@@ -450,8 +450,8 @@ class LocateResult(_Placed):
             columns |= {"triplet_score": self.scores[:, 0], "matched_share": self.scores[:, 1]}
             columns["pair_score"] = score_pairs(*self.scores.T)
         added = zip(*(column.tolist() for column in columns.values()), strict=True)
-        scores = [PairScores(**dict(zip(columns, values, strict=True))) for values in added]
-        scores = scores or [PairScores()] * len(self.directions.pairs)
+        scores = [MethodScores(**dict(zip(columns, values, strict=True))) for values in added]
+        scores = scores or [MethodScores()] * len(self.directions.pairs)
         usable, names, axes = self.directions.usable(), self.images.names, self.gauge.axes
         further = [piece.placement for piece in self.further]
         support = self.directions.num_inliers[usable]

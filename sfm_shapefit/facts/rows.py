@@ -14,7 +14,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.placed import folder_of
-from sfm_shapefit.facts.tables import CameraRow, PairRow, PairScores, name_in, write_csv
+from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow, name_in, write_csv
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.rigidity import left_out_reasons
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -164,7 +164,7 @@ def pair_rows(
     placement: Judged,
     support: IntArray,
     further: Sequence[Judged] = (),
-    scores: Sequence[PairScores] = (),
+    scores: Sequence[MethodScores] = (),
 ) -> list[PairRow]:
     """Return one row per pair of cameras (m,), with its number of inlier matches, and `scores`.
 
@@ -197,7 +197,7 @@ def pair_rows(
                 verdict=verdict.value,
                 reason=reason,
                 scores=replace(
-                    scores[edge] if scores else PairScores(),
+                    scores[edge] if scores else MethodScores(),
                     weight=weight,
                     dual_norm=dual_norm,
                     leverage=leverage,

@@ -62,7 +62,7 @@ class CameraRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PairScores:
+class MethodScores:
     """What the method computes of a pair, for who studies it; NaN is an empty field."""
 
     weight: float = math.nan
@@ -102,7 +102,7 @@ class PairRow:
     """Why it is undetermined."""
     prior_angle_deg: float = math.nan
     """Angle between the direction and the baseline of the position priors, where both cameras have one."""
-    scores: PairScores = field(default=PairScores(), repr=False)
+    scores: MethodScores = field(default=MethodScores(), repr=False)
     """Columns under their own names."""
 
     @property
@@ -129,7 +129,7 @@ def _values_of(rows: Sequence[Any], row_type: type, dimension: int) -> dict[str,
     found: dict[str, list[Any]] = {}
     for item in fields(row_type):
         if item.name == "scores":
-            found |= _values_of([row.scores for row in rows], PairScores, dimension)
+            found |= _values_of([row.scores for row in rows], MethodScores, dimension)
             continue
         values, names = [getattr(row, item.name) for row in rows], columns_of_field(item.name, dimension)
         if names == [item.name]:
@@ -262,7 +262,7 @@ def columns_of(
         n values each: numbers are float64, or int64 and bool where none can be missing, NaN where there is
         none; texts are objects.
     """
-    kinds = {item.name: item.type for item in (*fields(row_type), *fields(PairScores))}
+    kinds = {item.name: item.type for item in (*fields(row_type), *fields(MethodScores))}
     values = _values_of(rows, row_type, dimension)
     return {name: _column(column, kinds.get(name)) for name, column in values.items()}
 

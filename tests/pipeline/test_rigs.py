@@ -468,7 +468,7 @@ def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_t
     write_workspace(scene, tmp_path / "yard")
     database = edit_database(tmp_path / "yard" / "database.db", keep_few_matches(16, 8))
     found = sfm_shapefit.map_database(database)
-    assert [len(model.names) for model in found.models] == [16, 16]
+    assert [len(model.averaged_names) for model in found.models] == [16, 16]
     (told,) = found.joins
     assert told.join is not None, told.statement
     assert told.join.to_from_piece.scale == 1.0
