@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_shapefit.facts.model import EvidenceShares, ModelFacts, ModelInputs
 from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece, Solve
-from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.report.drawing import Poses, build_drawing
@@ -82,15 +82,16 @@ def _pair(e, names, centers, rng):
         return PairRow(name1=names[i], name2=names[j], support=9, reason="too few matches")
     baseline = centers[i] - centers[j]
     direction = baseline / (np.linalg.norm(baseline) or 1.0)
+    support, weight = int(rng.lognormal(4.5, 0.8)) + 15, float(rng.uniform(0.2, 1))
     return PairRow(
         name1=names[i],
         name2=names[j],
         direction=tuple(direction),
-        support=int(rng.lognormal(4.5, 0.8)) + 15,
-        weight=float(rng.uniform(0.2, 1)),
+        support=support,
         residual_deg=float(rng.uniform(5, 160) if wrong else rng.lognormal(-2.5, 0.8)),
-        dual_norm=float(rng.uniform(0, 1)),
-        leverage=float(rng.uniform(0, 0.9)),
+        scores=MethodScores(
+            weight=weight, dual_norm=float(rng.uniform(0, 1)), leverage=float(rng.uniform(0, 0.9))
+        ),
         verdict="undetermined" if undetermined else "outlier" if wrong else "inlier",
         reason="no other pair checks it" if undetermined else "",
     )

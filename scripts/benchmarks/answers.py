@@ -107,7 +107,7 @@ class Runner:
             words += ["--config", told.name]
         start = time.perf_counter()
         run = self.run([sys.executable, "-m", "sfm_shapefit.cli", *words])
-        said = [line for line in run.stderr.splitlines() if line.strip()]
+        said = [line for line in run.stderr.splitlines() if line.strip() and not line.endswith(" so far")]
         answer: Answer = {"exit": run.code, "verdict": "", "said": said[-1] if said else ""}
         parts = ("models", "tables", "json", "texts", "pages", "digests")
         answer |= {"files": [], "printed": "", **{part: {} for part in parts}}

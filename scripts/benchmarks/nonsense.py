@@ -193,14 +193,14 @@ def judge_mapped(path: Path, scene_of: np.ndarray) -> Iterator[tuple[str, str]]:
     except ShapeFitError:
         return
     for model in found.models:
-        is_false = joins(model.located.reconstruction, scene_of)
-        yield "map" * is_false, model.located.verdict.grade.value
-        verdict = sfm_shapefit.check(model.located.reconstruction, path, second_opinion=found).verdict
+        is_false = joins(model.reconstruction, scene_of)
+        yield "map" * is_false, model.verdict.grade.value
+        verdict = sfm_shapefit.check(model.reconstruction, path, second_opinion=found).verdict
         yield "check" * is_false, verdict.grade.value
         try:
             yield (
                 "locate" * is_false,
-                sfm_shapefit.locate(model.located.reconstruction, path).verdict.grade.value,
+                sfm_shapefit.locate(model.reconstruction, path).verdict.grade.value,
             )
         except ShapeFitError:
             yield "locate" * is_false, "refused"

@@ -112,7 +112,7 @@ def measure_yard(rig: str) -> list[Row]:
 
 def _map_ours(workspace: Path, adjust: Any) -> pycolmap.Reconstruction:
     found = sfm_shapefit.map_database(workspace / "database.db", adjust=adjust)
-    return found.models[0].located.reconstruction
+    return found.models[0].reconstruction
 
 
 def _run(method: str, scene: SceneCameras, workspace: Path) -> Outcome:

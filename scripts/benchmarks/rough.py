@@ -57,7 +57,7 @@ def measure(name: str, folder: Path, truth: str, args: argparse.Namespace) -> li
         shutil.copyfile(folder / "database.db", database)
         guess_focal_lengths(database, 1.0 + OFF)
         mapped, _, seconds = warm(lambda: sfm_shapefit.map_database(database, threads=args.threads))
-        error = sfm_shapefit.evaluate(mapped.models[0].located, folder / truth).position.mean
+        error = sfm_shapefit.evaluate(mapped.models[0], folder / truth).position.mean
         poses, rows, exact = Path(work) / "transforms.json", [], exact_error(folder / truth)
         for sigma_deg in SIGMAS_DEG[:1] if args.quick else SIGMAS_DEG:
             runs = [

@@ -85,10 +85,10 @@ class Writers(NamedTuple):
 
     draw: Callable[[Any], str]
     """Returns the page that a result shows in a notebook."""
-    page: Callable[..., None]
-    """Writes a page of a result."""
-    folder: Callable[..., None]
-    """Writes the folder of a result."""
+    page: Callable[..., Path]
+    """Writes a page of a result, and returns it."""
+    folder: Callable[..., Path]
+    """Writes the folder of a result, and returns it."""
 
 
 _loaders: list[Callable[[], Writers]] = []
@@ -104,8 +104,8 @@ class Reported(Displayed):
 
     __slots__ = ()
 
-    def report(self, page: Path | str, *, images: Path | str = "", overwrite: bool = False) -> None:
-        """Write a page that explains the result and works offline.
+    def report(self, page: Path | str, *, images: Path | str = "", overwrite: bool = False) -> Path:
+        """Write a page that explains the result and works offline, and return its path.
 
         Args:
             page: the file to be made.
@@ -115,7 +115,7 @@ class Reported(Displayed):
         Raises:
             InputError: if the file exists or cannot be written, or the folder has none of the images.
         """
-        _loaders[0]().page(self, page, images=images, overwrite=overwrite)
+        return _loaders[0]().page(self, page, images=images, overwrite=overwrite)
 
 
 class Written(Reported):
@@ -128,8 +128,8 @@ class Written(Reported):
     def __dir__(self) -> Iterable[str]:
         return sorted({*self._PUBLIC, "facts", "report", "summary", "verdict", "write"})
 
-    def write(self, out: Path | str, **options: Any) -> None:
-        """Write the result into a new or empty folder, which is filled in one step.
+    def write(self, out: Path | str, **options: Any) -> Path:
+        """Write the result into a new or empty folder, which is filled in one step, and return it.
 
         Args:
             out: the folder: the model, tables, locate.json and report.html.
@@ -138,7 +138,7 @@ class Written(Reported):
         Raises:
             InputError: if the folder holds something or cannot be written.
         """
-        _loaders[0]().folder(self, out, **options)
+        return _loaders[0]().folder(self, out, **options)
 
 
 def report_in_notebook(found: Any) -> str:

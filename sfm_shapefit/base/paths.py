@@ -1,5 +1,6 @@
 """What a path may be before it is opened: an ordinary file, a folder, an image inside one."""
 
+import os
 import stat
 from pathlib import Path
 
@@ -20,6 +21,17 @@ def refuse_irregular_file(path: Path) -> None:
         raise InputError(f"{path} cannot be read: Is a directory")
     if not stat.S_ISREG(mode):
         raise InputError(f"{path} cannot be read: it is a pipe or a device; give an ordinary file")
+
+
+def refuse_absent(*paths: Path | None) -> None:
+    """Refuse inputs that are not there, which whoever reads them says too late for who has to wait.
+
+    Raises:
+        InputError: for the first of them; None passes.
+    """
+    for path in paths:
+        if path is not None and not os.path.exists(path):
+            raise InputError(f"{path} does not exist")
 
 
 def refuse_no_folder(folder: Path) -> None:

@@ -1,14 +1,41 @@
 """How names and numbers are said: the first of many, counts with their noun, figures."""
 
-from collections.abc import Sequence
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 
 _NAMED = 3  # names; a longer list is counted, so that a sentence stays one
+_FEWEST = 3  # images of a folder or clip; fewer are named one by one
 
 
 def first_of(names: Sequence[str]) -> str:
     """Return the first three names and how many more there are."""
     more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
     return f"{', '.join(names[:_NAMED])}{more}"
+
+
+def reasons_by_place(reasons: Mapping[str, str], names: Sequence[str]) -> list[str]:
+    """Return a line for each image and its reason, or for each folder or clip whose images all have one.
+
+    Args:
+        reasons: why, by the names of some images.
+        names: all images. A clip has the images of a folder whose names differ by the last number alone.
+    """
+    sizes = Counter(place for name in names for place in _places(name))
+    there = Counter(place for name in reasons for place in _places(name))
+    whole = {place for place, n in there.items() if _FEWEST <= n == sizes[place] < len(names)}
+    lines: dict[str, str] = {}
+    for name, reason in reasons.items():
+        place = next((place for place in _places(name) if place in whole), "")
+        every = f"all {there[place]:,} images of {place}, {name} for one: {reason}"
+        lines.setdefault(place or name, every if place else f"{name}: {reason}")
+    return list(lines.values())
+
+
+def _places(name: str) -> Iterator[str]:
+    """Yield the folders that an image is in, the outermost first, and its clip."""
+    yield from (name[: slash.end()] for slash in re.finditer("/", name))
+    yield re.sub(r"\d+(?=\D*$)", "*", name)
 
 
 def make_printable(text: str) -> str:

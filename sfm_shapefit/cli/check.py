@@ -16,7 +16,6 @@ from sfm_shapefit.cli.console import (
     print_json,
     print_lines,
     report_errors,
-    show_progress,
 )
 from sfm_shapefit.cli.flags import (
     STRICT_HELP,
@@ -29,6 +28,7 @@ from sfm_shapefit.cli.flags import (
     Quiet,
     one_path,
 )
+from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
 
 if TYPE_CHECKING:

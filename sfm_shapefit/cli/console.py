@@ -1,6 +1,6 @@
-"""What the user sees: errors as one sentence and an exit code, progress on stderr, tables on stdout.
+"""What the user sees: errors as one sentence and an exit code on stderr, answers and tables on stdout.
 
-The door to rich. Exit codes: 0 done; 2 wrong usage; 3 bad input; 4 the view graph cannot be solved;
+Exit codes: 0 done; 2 wrong usage; 3 bad input; 4 the view graph cannot be solved;
 5 a package is missing; 130 interrupted; 141 nobody reads any more.
 """
 
@@ -9,21 +9,16 @@ import os
 import re
 import signal
 import sys
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
 from sfm_shapefit.base.display import Row, Telling
 from sfm_shapefit.base.errors import MissingExtraError, ShapeFitError, UnsolvableError
 from sfm_shapefit.base.wording import make_printable
-
-if TYPE_CHECKING:
-    from sfm_shapefit.base.clock import Progress
-    from sfm_shapefit.pipeline.warm_up import Tell
 
 EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING = 3, 4, 5  # exit codes; see the header
 EXIT_INTERRUPTED, EXIT_PIPE = 130, 141  # exit codes; 128 and the number of the signal
@@ -35,8 +30,6 @@ _THREAD_BYTES = 50_000_000  # bytes; stack and work space of a thread of the lin
 _NO_MEMORY = ("can't start new thread", "bad_alloc", "failed to map segment", "Cannot allocate memory")
 """Words of Python, C++ and the dynamic linker for a lack of memory."""
 
-_COMPILING = "compiling kernels, once; they are kept on disk"
-
 _WARNING_STYLE = "bold yellow"
 _GRADE_STYLES = {
     "good": "bold green",
@@ -45,7 +38,6 @@ _GRADE_STYLES = {
     "do not use": "bold red",
 }
 
-_SAID_EVERY_S = 2.0  # seconds between lines of progress where there is no terminal; logs stay short
 _AGAIN_S = 0.02  # seconds after which a lost interrupt comes again; native code has returned by then
 
 flag_names, key_names = set[str](), set[str]()
@@ -180,7 +172,7 @@ def refuse_little_memory() -> None:
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     needed = _LIBRARIES_BYTES + _THREAD_BYTES * (os.cpu_count() or 1)
     if limit != resource.RLIM_INFINITY and limit < needed:
-        _say(
+        say(
             f"this process may use {limit / 1e6:.0f} MB of address space, but its libraries need "
             f"{needed / 1e6:.0f} MB; raise the limit (ulimit -v)"
         )
@@ -188,11 +180,12 @@ def refuse_little_memory() -> None:
 
 
 def _fail(message: str, code: int) -> None:
-    _say(message)
+    say(message)
     raise typer.Exit(code)
 
 
-def _say(message: str) -> None:
+def say(message: str) -> None:
+    """Say a sentence on stderr, with options as they are typed."""
     print(f"sfm-shapefit: {make_printable(in_flags(message))}", file=sys.stderr)  # noqa: T201
 
 
@@ -207,73 +200,6 @@ def in_flags(text: str) -> str:
         return flag if value == "True" else f"{flag} {value}"
 
     return re.sub(r"\b([a-z_]+)=([\w.]*\w)", typed, text)
-
-
-@contextmanager
-def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | None]":
-    """Show stages on stderr: as bars if it is a terminal, or, verbose, a line where each begins.
-
-    Bars are written to a copy of stderr, which nobody silences. They do not go with the messages that
-    pycolmap writes between them, so there are none if those are wanted.
-    """
-    from sfm_shapefit.base.jit import on_compilation
-    from sfm_shapefit.pipeline.warm_up import compile_together
-
-    if verbose:
-        with on_compilation(lambda: _say(_COMPILING)), compile_together(say_now_and_then(), _say):
-            yield _say_stage
-        return
-    if not (enabled and sys.stderr.isatty()):
-        with compile_together(_say_nothing, _say if enabled else _say_nothing):
-            yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Display
-
-    done_of_all = MofNCompleteColumn(separator=" of ")
-    columns = (TextColumn("{task.description:<20}"), BarColumn(), done_of_all, TimeElapsedColumn())
-    with (
-        os.fdopen(os.dup(2), "w") as stream,
-        Display(*columns, console=Console(file=stream, force_terminal=True)) as display,
-        on_compilation(lambda: display.console.print(_COMPILING)),
-    ):
-        tasks: dict[str, Any] = {}
-
-        def advance(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = display.add_task(stage, total=total)
-            shown = display.tasks[tasks[stage]]
-            if total > 1 or shown.total == 1:
-                display.update(tasks[stage], completed=done, total=total)
-            elif done == total:
-                # The stage is over, perhaps sooner than its limit.
-                display.update(tasks[stage], total=shown.completed)
-
-        with compile_together(lambda done, total: advance("compiling", done, total), display.console.print):
-            yield advance
-
-
-def _say_nothing(*_what: Any) -> None:
-    """Tell nobody."""
-
-
-def say_now_and_then() -> "Tell":
-    """Return a function that says on stderr, every few seconds, how many kernels are compiled."""
-    said, said_at = 0, time.monotonic()
-
-    def tell(done: int, total: int) -> None:
-        nonlocal said, said_at
-        if done > said and (time.monotonic() - said_at > _SAID_EVERY_S or done == total):
-            said, said_at = done, time.monotonic()
-            _say(f"compiling {done} of {total}")
-
-    return tell
-
-
-def _say_stage(stage: str, done: int, total: int) -> None:
-    if (done, total) == (0, 1):
-        _say(stage)
 
 
 def print_table(title: str, rows: Iterable[Row], elsewhere: str = "") -> None:

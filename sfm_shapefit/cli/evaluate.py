@@ -66,11 +66,13 @@ def evaluate_command(
     truth = one_path(reference, None, "REF")
     with report_errors():
         from sfm_shapefit.base.atomic_folder import atomic_file
+        from sfm_shapefit.base.paths import refuse_absent
         from sfm_shapefit.facts.tables import write_records
         from sfm_shapefit.pipeline.evaluate import evaluate, evaluate_against_table
         from sfm_shapefit.pipeline.write import refuse_file
 
         if csv is not None:
+            refuse_absent(source, truth)
             refuse_file(csv, overwrite=overwrite, protect=[source, truth])
         errors: Evaluation | PositionEvaluation
         if truth.is_file() and truth.suffix.lower() in _TABLES:

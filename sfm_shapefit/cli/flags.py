@@ -14,6 +14,7 @@ from typer.core import TyperCommand
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import S, Settings, hint, homes_of, option, setting_groups
+from sfm_shapefit.cli.colmap_names import answer_for
 from sfm_shapefit.cli.console import flag_names, key_names
 from sfm_shapefit.cli.root import convert_plainly
 
@@ -176,13 +177,15 @@ class GroupedCommand(TyperCommand):
         if _HELP_ALL in args and not ctx.resilient_parsing:
             ctx.meta[_ALL_OPTIONS] = True
             args = ["--help"]
-        known = {name for parameter in self.get_params(ctx) for name in parameter.opts}
+        parameters = self.get_params(ctx)
+        known = {name for one in parameters for name in (*one.opts, *one.secondary_opts)}
+        args = _with_hyphens(args, known)
         flag_names.update(name.removeprefix("--").replace("-", "_") for name in known)
         if not ctx.resilient_parsing:
             self._refuse_unknown(ctx, args, known)
         if "--database" in known:
             ctx.allow_extra_args = True  # so that they can be looked at
-        convert_plainly(self.get_params(ctx))
+        convert_plainly(parameters)
         try:
             extra = super().parse_args(ctx, _gather_values(args))
         except typer.BadParameter as error:
@@ -207,6 +210,20 @@ class GroupedCommand(TyperCommand):
                 ctx.fail(f"{flag} is a key of --config: {name} = ...")
             if others := _commands_with(name):
                 ctx.fail(f"{flag} is an option of {others}")
+            if answer := answer_for(flag, known):
+                ctx.fail(answer)
+
+
+def _with_hyphens(args: Sequence[str], known: set[str]) -> list[str]:
+    """Return arguments with flags as they are known, where underscores stand in the place of hyphens."""
+    flags = itertools.takewhile(lambda word: word != "--", args)
+    spelled = []
+    for word in flags:
+        flag, equals, value = word.partition("=")
+        hyphened = flag.replace("_", "-")
+        is_typed = flag.startswith("--") and flag not in known and hyphened in known
+        spelled.append(f"{hyphened}{equals}{value}" if is_typed else word)
+    return [*spelled, *args[len(spelled) :]]
 
 
 def _bare(name: str) -> str:
@@ -324,20 +341,28 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
         typer.BadParameter: if it is no TOML, or an option is unknown or has a wrong value.
     """
     known = homes_of(settings)
-    values = _read_toml(config, settings) if config else {}
+    in_file = _read_toml(config, settings) if config else {}
     flags = {name: value for name, value in given.items() if value is not None and name in known}
     for name in _REPEATED.keys() & flags.keys():
         flags[name] = tuple(_values_of(name, text) for text in flags[name])
     flags |= {name: _word_or_number(flags[name]) for name in _WORDS_OR_NUMBERS & flags.keys()}
-    values |= flags
     try:
-        return settings(**values)
+        return settings(**in_file | flags)
     except (TypeError, ValueError) as error:
-        message = f"{config}: {error}" if config and isinstance(error, TypeError) else str(error)
+        message = f"{config}: {error}" if _is_wrong_alone(settings, in_file, str(error)) else str(error)
         for name in flags:  # an option of the file keeps its spelling
             message = re.sub(rf"\b{name}(?=[ =])", _flag_of(name), message)
             message = message.replace(f"{_flag_of(name)}=", f"{_flag_of(name)} ")
         raise typer.BadParameter(message) from error
+
+
+def _is_wrong_alone(settings: type[Settings], values: dict[str, Any], message: str) -> bool:
+    """Return whether the values of a file alone are refused in the same words."""
+    try:
+        settings(**values)
+    except (TypeError, ValueError) as error:
+        return str(error) == message
+    return False
 
 
 def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
@@ -354,7 +379,9 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
     homes = homes_of(settings)
     for name in read.keys() - {*homes, *homes.values()}:
-        raise typer.BadParameter(f"{path}: {name!r} {_describe_unknown(name, sorted(homes))}")
+        raise typer.BadParameter(
+            f"{path}: {name!r} {_describe_unknown(name, sorted({*homes, *homes.values()}))}"
+        )
     return read
 
 

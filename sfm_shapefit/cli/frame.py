@@ -21,9 +21,10 @@ from sfm_shapefit.cli.console import (
     print_json,
     print_table,
     report_errors,
-    show_progress,
 )
 from sfm_shapefit.cli.flags import OutputFlags, read_options
+from sfm_shapefit.cli.progress import show_progress
+from sfm_shapefit.facts.options import FIX_SOLVED
 from sfm_shapefit.files.options import MADE_FIRST
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     Result = LocateResult | MapResult | GraphResult | JoinedModel
 
 _BLACK = "the points have none; --images FOLDER gives them those of the images"
+_IN_PLACE_OF_FILES = {"database", FIX_SOLVED}
+"""Words that options take where else they take a file."""
 _NOTICED_S = 1.0  # seconds; a user does not notice less compiling
 
 
@@ -127,6 +130,21 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
         raise InputError(f"{target} {what}, but OUT is a folder to be made; the order is {order}{first}")
 
 
+def _refuse_unreadable(order: str, inputs: Sequence[Path | None], has_images: bool) -> None:
+    """Raise InputError if a database, images or models, with theirs after them, cannot be read."""
+    from sfm_shapefit.files.colmap.listed_poses import read_source
+    from sfm_shapefit.files.colmap.photographs import find_photographs
+    from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
+
+    first = inputs[0]
+    if order == "DATABASE OUT" and first is not None:
+        find_photographs(first) if has_images else DatabaseFile(database_in(first)).close()
+    elif order.startswith("MODEL"):
+        *models, database = inputs[:2] if order == "MODEL OUT" else inputs
+        for model in filter(None, models):
+            read_source(model, database)
+
+
 @contextmanager
 def command_run(
     settings: type[S],
@@ -145,14 +163,13 @@ def command_run(
     started = time.perf_counter()
     with report_errors(target if begun is None else target / "map.json", begun):
         from sfm_shapefit.base.atomic_folder import claimed_output
+        from sfm_shapefit.base.paths import refuse_absent, refuse_no_folder
         from sfm_shapefit.files.model_folder import refuse_no_model
 
         flags = read_options(OutputFlags, given)
         config = Path(flags.config) if flags.config else None
         options = read_options(settings, given, config)
         if flags.images:  # now, not when all is computed
-            from sfm_shapefit.base.paths import refuse_no_folder
-
             refuse_no_folder(Path(flags.images))
         values = flat_values(options)
         named = [flags.images, *(values.get(n, "") for n in ("fix", "without", "control_points", "gravity"))]
@@ -163,6 +180,9 @@ def command_run(
             refuse_swapped(inputs[0], target, order)
         if order.startswith("MODEL"):
             refuse_no_model(inputs[0])
+        refuse_absent(*(path for path in protect if str(path) not in _IN_PLACE_OF_FILES))
+        if target.exists() and not flags.overwrite:  # what is wrong with the input is said first
+            _refuse_unreadable(order, inputs, has_images=begun is not None)
         kept = () if begun is None else MADE_FIRST
         with claimed_output(target, overwrite=flags.overwrite, protect=run.protect, kept=kept):
             from sfm_shapefit.base.kernel_cache import measure_compilation

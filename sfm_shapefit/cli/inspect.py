@@ -8,7 +8,7 @@ import typer
 
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.cli.console import print_json, print_lines, print_table, report_errors, show_progress
+from sfm_shapefit.cli.console import print_json, print_lines, print_table, report_errors
 from sfm_shapefit.cli.flags import (
     Config,
     Database,
@@ -20,6 +20,7 @@ from sfm_shapefit.cli.flags import (
     read_options,
     takes,
 )
+from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.options import InspectOptions
 

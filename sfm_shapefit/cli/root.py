@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from sfm_shapefit import __version__
+from sfm_shapefit.cli.colmap_names import COMMANDS
 from sfm_shapefit.cli.console import (
     EXIT_INTERRUPTED,
     catch_termination,
@@ -69,6 +70,12 @@ class _ByImportance(TyperGroup):
         """Parse the flags before the command."""
         convert_plainly(self.get_params(ctx))
         return super().parse_args(ctx, args)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that is called; one of COLMAP's is answered with what it is here."""
+        if args[0] in COMMANDS and args[0] not in self.commands:
+            ctx.fail(f"{args[0]} is COLMAP's; here it is sfm-shapefit {COMMANDS[args[0]]}")
+        return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return all names, those of the groups first."""

@@ -17,6 +17,7 @@ from sfm_shapefit.cli.flags import (
     read_options,
     takes,
 )
+from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions, WorkspaceOptions
 
@@ -71,7 +72,9 @@ def _write_drawn(
     from sfm_shapefit.synthetic.rendered_workspace import judge_matches, write_rendered_workspace
 
     scene = make_rendered_scene(options, render)
-    write_rendered_workspace(scene, target, workspace)
+    with show_progress(True) as progress:
+        assert progress is not None
+        write_rendered_workspace(scene, target, workspace, progress)
     rows = [row("images", str(scene.num_images))]
     if workspace.database:
         judged = judge_matches(scene, target / "database.db")

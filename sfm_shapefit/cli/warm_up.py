@@ -1,8 +1,11 @@
 """`sfm-shapefit warm-up`."""
 
+from functools import partial
+
 from sfm_shapefit.base.display import row
-from sfm_shapefit.cli.console import print_table, report_errors, say_now_and_then, show_progress
+from sfm_shapefit.cli.console import print_table, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, Quiet
+from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
 
 
@@ -21,11 +24,7 @@ def warm_up_command(*, quiet: Quiet = False) -> None:
         from sfm_shapefit.pipeline.warm_up import WarmUpError, not_done, warm_up
 
         with show_progress(not quiet) as progress:
-            if progress:
-                show = progress
-                done = warm_up(not_done(), lambda ready, total: show("compiling", ready, total))
-            else:
-                done = warm_up(not_done(), None if quiet else say_now_and_then())
+            done = warm_up(not_done(), partial(progress, "compiling kernels") if progress else None)
         if done.failures:
             raise WarmUpError("; ".join(done.failures))
         if not quiet:

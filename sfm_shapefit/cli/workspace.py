@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from sfm_shapefit.cli.console import print_lines, report_errors, show_progress
+from sfm_shapefit.cli.console import print_lines, report_errors
 from sfm_shapefit.cli.flags import (
     GroupedCommand,
     InputPath,
@@ -15,6 +15,7 @@ from sfm_shapefit.cli.flags import (
     Quiet,
     one_path,
 )
+from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
 
 

@@ -7,13 +7,14 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, rounded
+from sfm_shapefit.facts.intrinsics import label_lens
 from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape, SecondOpinion, how_far
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE, Lens
+from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE
 
 _UNLIKE = 2.0  # scatters of what images ask for; a mean that is nearer names no other focal length
 _LEAST_TOLD = 1e-5  # share of the spread; a smaller difference is not told as a number
@@ -23,6 +24,7 @@ class ContradictedLens(Record):
     """A lens whose images, left out one by one, ask for another focal length."""
 
     camera: Annotated[int, "Its id in the model."]
+    image: Annotated[str, "The first of its images."]
     num_images: Annotated[int, "Images that were asked."]
     focal_px: Annotated[float, "Mean focal length of the model."]
     asked_focal_px: Annotated[float, "Focal length that its images ask for, the median one."]
@@ -32,18 +34,23 @@ class ContradictedLens(Record):
     remedy: Annotated[str, "What to do about it, or what has been done."]
 
     @property
+    def label(self) -> str:
+        """Its id, and the images by which a user knows it."""
+        return label_lens(self.camera, self.image, self.num_images)
+
+    @property
     def statement(self) -> str:
         """The same in a sentence."""
         asked = f"{self.asked_focal_px:,.0f} ± {self.asked_sigma_px:,.0f} px"
         if abs(self.asked_focal_px - self.focal_px) < _UNLIKE * self.asked_sigma_px:
             return (
-                f"the focal length of camera {self.camera}, {self.focal_px:,.0f} px, is doubtful: its "
+                f"the focal length of {self.label}, {self.focal_px:,.0f} px, is doubtful: its "
                 f"{self.num_images} images ask for unlike ones by the points that the others make ({asked}), "
                 "so that the lens or the places of images are wrong"
             )
         who = "its image asks" if self.num_images == 1 else f"its {self.num_images} images ask"
         return (
-            f"the focal length of camera {self.camera} is wrong: {who} for {asked}, not {self.focal_px:,.0f} "
+            f"the focal length of {self.label} is wrong: {who} for {asked}, not {self.focal_px:,.0f} "
             f"px, by the points that the others make; its images stand wrong by that: {self.remedy}"
         )
 
@@ -212,12 +219,14 @@ class ToldEvidence(Record):
     @property
     def statements(self) -> list[str]:
         """A sentence for each."""
+        more = [lens.label for lens in self.lenses[1:]]
+        others = f"; likewise that of {first_of(more)}" if more else ""
         told = [
             *(one.statement for one in self.odd),
             *(one.statement for one in self.seams),
             *(one.statement for one in self.untied),
             *(one.statement for one in self.places),
-            *(one.statement for one in self.lenses),
+            *([self.lenses[0].statement + others] if self.lenses else []),
         ]
         second = self.second
         if second is not None and (second.wrong or second.undecided or second.ambiguous):
@@ -242,7 +251,7 @@ def tell_evidence(
         axes: (3, 3) rotation from the axes of the evidence to those of the output; the same if None.
     """
     return ToldEvidence(
-        lenses=tuple(_tell_lens(wrong, images.lenses[wrong.lens]) for wrong in evidence.lenses),
+        lenses=tuple(_tell_lens(wrong, images) for wrong in evidence.lenses),
         odd=tuple(
             OddImages.taken_from(one, images=tuple(images.names[k] for k in one.cameras.tolist()))
             for one in evidence.oddities
@@ -287,7 +296,8 @@ def _cameras(names: tuple[str, ...]) -> str:
     return f"{counted(len(names), 'camera')} ({first_of(names)}) {stand}"
 
 
-def _tell_lens(wrong: WrongLens, lens: Lens) -> ContradictedLens:
+def _tell_lens(wrong: WrongLens, images: Images) -> ContradictedLens:
+    lens = images.lenses[wrong.lens]
     asked_px, remedy = (
         wrong.factor * lens.focal_px,
         "intrinsics=focal lets it change, or calibrate that camera",
@@ -298,6 +308,7 @@ def _tell_lens(wrong: WrongLens, lens: Lens) -> ContradictedLens:
         remedy = "it was adjusted already, so calibrate that camera"
     return ContradictedLens(
         camera=lens.id,
+        image=images.names[int(np.argmax(images.lens_of == wrong.lens))],
         num_images=wrong.num_images,
         focal_px=lens.focal_px,
         asked_focal_px=asked_px,

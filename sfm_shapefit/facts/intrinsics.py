@@ -26,6 +26,7 @@ class CameraIntrinsics(Record):
     """A camera whose intrinsics were in doubt, and what became of them."""
 
     camera: Annotated[int, "Its id in the model."]
+    image: Annotated[str, "The first of the placed images that it took."]
     num_images: Annotated[int, "Placed images that it took."]
     model: Annotated[str, "COLMAP's name of its model."]
     origin: Annotated[str, "Origin of the given parameters: a guess, EXIF data, or a calibration."]
@@ -44,7 +45,7 @@ class CameraIntrinsics(Record):
     @property
     def statement(self) -> str:
         """What the camera was given, what it has, and why."""
-        head = f"camera {self.camera}: focal length {self.given_focal_px:,.1f} px ({self.origin})"
+        head = f"{self.label}: focal length {self.given_focal_px:,.1f} px ({self.origin})"
         if self.decided_by == "undetermined":
             return f"{head} kept, as the matches do not determine it{self._distortion()}"
         if self.decided_by == "held":
@@ -52,6 +53,11 @@ class CameraIntrinsics(Record):
         by = "by the view graph" if self.decided_by == "view graph" else "by adjustment"
         doubt = "" if self.focal_sigma_px is None else f" ± {self.focal_sigma_px:,.1f}"
         return f"{head} became {self.focal_px:,.1f}{doubt} px ({self.change:+.1%}) {by}{self._distortion()}"
+
+    @property
+    def label(self) -> str:
+        """Its id, and the images by which a user knows it."""
+        return label_lens(self.camera, self.image, self.num_images)
 
     @property
     def cells(self) -> list[str]:
@@ -114,7 +120,8 @@ class RefinedIntrinsics:
 
     def rows(self, images: Images) -> list[CameraIntrinsics]:
         """Return a row for each lens that took placed images and was in doubt."""
-        counts = np.bincount(images.lens_of[images.is_posed], minlength=len(images.lenses)).tolist()
+        posed = np.flatnonzero(images.is_posed)
+        counts = np.bincount(images.lens_of[posed], minlength=len(images.lenses)).tolist()
         rows = []
         for k, lens in enumerate(images.lenses):
             if lens.origin is None or not counts[k]:
@@ -124,6 +131,7 @@ class RefinedIntrinsics:
             rows.append(
                 CameraIntrinsics(
                     camera=lens.id,
+                    image=images.names[int(posed[np.argmax(images.lens_of[posed] == k)])],
                     num_images=counts[k],
                     model=lens.model,
                     origin=lens.origin.value,
@@ -144,17 +152,26 @@ def intrinsics_in_doubt(parts: BoolArray, by_view_graph: BoolArray) -> RefinedIn
     return RefinedIntrinsics(parts, by_view_graph, unknown, nothing)
 
 
+def label_lens(camera: int, image: str, num_images: int) -> str:
+    """Return a camera in COLMAP's sense by its id and one of its images, and how many others it took."""
+    return f"camera {camera} ({image}{f' and {num_images - 1:,} more' if num_images > 1 else ''})"
+
+
 def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
     """Return a sentence for each camera in doubt, most images first; of many, one for all."""
     if len(rows) <= _NAMED:
         return [row.statement for row in sorted(rows, key=lambda row: (-row.num_images, row.camera))]
-    changes = [row.change for row in rows if row.decided_by in _FOUND]
+    found = [row for row in rows if row.decided_by in _FOUND]
+    changes = [row.change for row in found]
     unknown = sum(row.decided_by == "undetermined" for row in rows)
     held = len(rows) - len(changes) - unknown
     parts = [f"{len(changes)} of {len(rows)} cameras in doubt have another focal length now"]
     if changes:
         low, middle, high = np.quantile(changes, [0.0, 0.5, 1.0])
-        parts = [f"{parts[0]}, by {low:+.1%} to {high:+.1%} (median {middle:+.1%})"]
+        parts = [
+            f"{parts[0]}, by {low:+.1%} to {high:+.1%} (median {middle:+.1%}), "
+            f"most that of {max(found, key=lambda row: abs(row.change)).label}"
+        ]
     parts += [f"{unknown} kept the given one, as the matches do not determine it"] if unknown else []
     parts += [f"{held} were not to be changed"] if held else []
     return ["; ".join(parts) + "; each stands in locate.json"]
@@ -177,20 +194,16 @@ def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
         ("held", "as intrinsics=held or adjust=none says, or as cameras are too many to be adjusted"),
         ("other model", f"as {ADJUSTED_ELSEWHERE}"),
     ):
-        cameras = [str(row.camera) for row in guessed if _why(row) == how]
+        cameras = [row.label for row in guessed if _why(row) == how]
         if cameras:
-            noun = "cameras" if len(cameras) > 1 else "camera"
             yield (
-                f"{noun} {first_of(cameras)} kept a focal length that was never measured, "
+                f"{first_of(cameras)} kept a focal length that was never measured, "
                 f"{what}; calibrate if the result is poor"
             )
     adjusted = (row for row in guessed if row.decided_by == "adjusted")
-    loose = [
-        str(row.camera) for row in adjusted if not (row.focal_sigma_px or np.inf) <= _LOOSE * row.focal_px
-    ]
+    loose = [row.label for row in adjusted if not (row.focal_sigma_px or np.inf) <= _LOOSE * row.focal_px]
     if loose:
         yield (
-            f"the matches hardly tell the focal length of {'cameras' if len(loose) > 1 else 'camera'} "
-            f"{first_of(loose)} (± {_LOOSE:.0%} or more), so these may stand too near to what they see, "
-            "or too far from it; calibrate them if that matters"
+            f"the matches hardly tell the focal length of {first_of(loose)} (± {_LOOSE:.0%} or more), so "
+            "images may stand too near to what they see, or too far from it; calibrate if that matters"
         )

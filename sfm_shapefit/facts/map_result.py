@@ -6,14 +6,14 @@ OUT/map.json        the averaging behind each, and the images in no model with t
 """
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sfm_shapefit.base.display import Row, Telling, Written, row
 from sfm_shapefit.base.settings import flat_values
-from sfm_shapefit.base.wording import counted
+from sfm_shapefit.base.wording import counted, reasons_by_place
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.model import (
     Averaging,
@@ -25,7 +25,7 @@ from sfm_shapefit.facts.model import (
 )
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Tabled
 from sfm_shapefit.judgement.grade import FEW_PLACED, in_another_model
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -34,23 +34,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MappedModel:
-    """One component of the images."""
-
-    located: LocateResult
-    averaging: AveragedRotations
-    """The rotations it started from, of the images in `names`."""
-    names: tuple[str, ...]
-
-    @property
-    def reconstruction(self) -> "pycolmap.Reconstruction":
-        """Cameras and points."""
-        return self.located.reconstruction
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class JoinedModel(Written, Tabled):
+class JoinedModel(Written, Stated):
     """Models in one world, and the evidence for them together."""
 
     _PUBLIC = ("reconstruction", "models", "joins", "cameras", "pairs", "table", "warnings", "timings_s")
@@ -72,24 +57,9 @@ class JoinedModel(Written, Tabled):
         return f"joined_{self.models[0]}"
 
     @property
-    def verdict(self) -> ModelVerdict:
-        """Whether the joined model can be used, and why."""
-        return self.facts.verdict
-
-    @property
     def image_names(self) -> tuple[str, ...]:
         """Names of its images."""
         return tuple(row.name for row in self.cameras)
-
-    @property
-    def timings_s(self) -> Mapping[str, float]:
-        """Seconds of each stage."""
-        return self.facts.timings_s
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """What the user should know."""
-        return self.facts.warnings
 
     @property
     def told(self) -> Telling:
@@ -103,17 +73,17 @@ class JoinedModel(Written, Tabled):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class MapResult(Written):
-    """The models of a database, and how they came about."""
+class MapResult(Written, Tabled):
+    """The models of a database, and how they came about; cameras, pairs and report are of the largest."""
 
     _PUBLIC = (
-        *("models", "reconstruction", "num_images", "num_placed", "left_out", "joins", "joined", "warnings"),
-        *("database", "options", "timings_s"),
+        *("models", "reconstruction", "cameras", "pairs", "table", "num_images", "num_placed", "left_out"),
+        *("joins", "joined", "warnings", "database", "options", "timings_s"),
     )
     database: Path
     options: MapOptions
-    models: tuple[MappedModel, ...]
-    """Models of the database, most placed cameras first."""
+    models: tuple[LocateResult, ...]
+    """Models of the database, most placed cameras first, as `locate` returns them."""
     num_images: int
     num_pairs: int
     """Pairs with a relative rotation."""
@@ -134,18 +104,28 @@ class MapResult(Written):
     @property
     def num_placed(self) -> int:
         """Number of cameras in all models."""
-        return sum(int(model.located.kept.sum()) for model in self.models)
+        return sum(int(model.kept.sum()) for model in self.models)
 
     @property
     def reconstruction(self) -> "pycolmap.Reconstruction":
         """The largest model."""
-        return self.models[0].located.reconstruction
+        return self.models[0].reconstruction
+
+    @property
+    def cameras(self) -> Sequence[CameraRow]:
+        """One row per image of the largest model."""
+        return self.models[0].cameras
+
+    @property
+    def pairs(self) -> Sequence[PairRow]:
+        """One row per pair of the largest model that was looked at."""
+        return self.models[0].pairs
 
     @property
     def verdict(self) -> ModelVerdict:
         """Whether the largest model can be used, and why; look at one that leaves many images to others."""
-        verdict = self.models[0].located.verdict
-        sizes = int(self.models[0].located.kept.sum()), *(one.facts.num_placed for one in self.joined)
+        verdict = self.models[0].verdict
+        sizes = int(self.models[0].kept.sum()), *(one.facts.num_placed for one in self.joined)
         here = max(sizes) / self.num_placed
         if verdict.grade is not Grade.GOOD or here >= FEW_PLACED:
             return verdict
@@ -161,10 +141,10 @@ class MapResult(Written):
             models=[
                 Component(
                     folder=str(number),
-                    num_images=len(model.names),
-                    num_placed=int(model.located.kept.sum()),
-                    averaging=Averaging(**model.averaging.summary()),
-                    located=model.located.facts,
+                    num_images=len(model.averaged_names),
+                    num_placed=int(model.kept.sum()),
+                    averaging=Averaging(**_averaging_of(model).summary()),
+                    located=model.facts,
                 )
                 for number, model in enumerate(self.models)
             ],
@@ -174,19 +154,21 @@ class MapResult(Written):
     @property
     def told(self) -> Telling:
         """What the terminal says: of each model, of joins, and of what was left out."""
-        largest, several = self.models[0].located.facts, len(self.models) > 1
+        largest, several = self.models[0].facts, len(self.models) > 1
         lines, rows = list[str](), list[Row]()
         details = [row("pairs", f"{counted(self.num_pairs, 'pair')} with a relative rotation")]
         for number, model in enumerate(self.models):
-            title = f"model {number}: {model.located.verdict.statement}" if several else ""
-            told = model.located.facts.told((), model.located.placement.refined.statement())
+            title = f"model {number}: {model.verdict.statement}" if several else ""
+            told = model.told
             lines += [title, *told.lines] if several else told.lines
             whose = f" of model {number}" if several else ""
             rows += [one._replace(label=f"{one.label}{whose}") for one in told.rows]
-            details += [row("model", title), row("rotations", model.averaging.statement), *told.details]
+            rotations = row("rotations", _averaging_of(model).statement)
+            details += [row("model", title), rotations, *told.details]
         rows += [row("join", one.statement) for one in self.joins]
         rows += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
-        rows += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
+        names = [*self.image_names, *self.left_out]
+        rows += [Row("in no model", reasons_by_place(self.left_out, names))]
         rows += [Row("warning", self.warnings)]
         usable = [one for one in self.joined if 0 in one.models and not one.verdict.is_bad]
         step = next_of_model(usable[0].verdict.grade, largest) if usable else largest.next_step
@@ -196,7 +178,7 @@ class MapResult(Written):
     @property
     def image_names(self) -> tuple[str, ...]:
         """Names of all images of the models."""
-        return tuple(name for model in self.models for name in model.located.image_names)
+        return tuple(name for model in self.models for name in model.image_names)
 
     def folder_of_join(self, join: Joined) -> str | None:
         """Return where the models of a join stand in one world; None if they were not joined."""
@@ -204,11 +186,17 @@ class MapResult(Written):
 
     def _repr_html_(self) -> str:
         """Return what matters of all models, and what the largest shows of itself."""
-        return f"<p>{html.escape(self._headline())}</p>{self.models[0].located._repr_html_()}"
+        return f"<p>{html.escape(self._headline())}</p>{self.models[0]._repr_html_()}"
 
     def _headline(self) -> str:
         models = counted(len(self.models), "model")
         return f"{self.num_placed} of {self.num_images} images placed in {models}"
+
+
+def _averaging_of(model: LocateResult) -> AveragedRotations:
+    """Return the rotations that a model of `map` started from."""
+    assert model.averaging is not None
+    return model.averaging
 
 
 def tell_joins(result: MapResult) -> MapResult:
@@ -216,5 +204,5 @@ def tell_joins(result: MapResult) -> MapResult:
     models = list(result.models)
     for join in result.joins:
         facts, model = join.facts(result.folder_of_join(join)), models[join.model]
-        models[join.model] = replace(model, located=replace(model.located, join=facts))
+        models[join.model] = replace(model, join=facts)
     return replace(result, models=tuple(models))

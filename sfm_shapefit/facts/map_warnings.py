@@ -1,11 +1,12 @@
 """What the user of `map` should know beyond the warnings of each model, a sentence each."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
+from sfm_shapefit.facts.map_result import JoinedModel
+from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.scene import describe_repeated_pairs, describe_rival_pairs
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.placement.options import KnownDistance
@@ -14,9 +15,7 @@ _ALARMING_SHARE = 0.7  # share of a model's agreeing pairs; below, warn (castle-
 _DOUBTFUL_SHARE = 0.25  # share of an image's agreeing pairs; below, its averaged rotation is doubtful
 
 
-def map_warnings(
-    incomplete_rigs: Sequence[int], models: Sequence[MappedModel], left_out: Mapping[str, str]
-) -> Iterator[str]:
+def map_warnings(incomplete_rigs: Sequence[int], models: Sequence[LocateResult]) -> Iterator[str]:
     """Yield what the user should know, a sentence each."""
     if incomplete_rigs:
         rig, count = f"rig {incomplete_rigs[0]} of the database", len(incomplete_rigs)
@@ -26,35 +25,33 @@ def map_warnings(
             "with colmap rig_configurator to place them together"
         )
     for number, model in enumerate(models):
-        share, agreements = model.averaging.share, model.averaging.agreements
-        is_good = model.located.verdict.grade is Grade.GOOD  # whatever its rotations were at first
+        averaging = model.averaging
+        assert averaging is not None
+        share, agreements = averaging.share, averaging.agreements
+        is_good = model.verdict.grade is Grade.GOOD  # whatever its rotations were at first
         if share < _ALARMING_SHARE and not is_good:
             yield f"model {number}: only {share:.0%} of the pairs agree with the averaged rotations"
-        if model.averaging.num_repeated:
-            yield f"model {number}: {describe_repeated_pairs(model.averaging.num_repeated)}"
-        if model.averaging.num_rivals:
-            yield f"model {number}: {describe_rival_pairs(model.averaging.num_rivals)}"
+        if averaging.num_repeated:
+            yield f"model {number}: {describe_repeated_pairs(averaging.num_repeated)}"
+        if averaging.num_rivals:
+            yield f"model {number}: {describe_rival_pairs(averaging.num_rivals)}"
         doubtful = np.flatnonzero(agreements < _DOUBTFUL_SHARE)
         if len(doubtful) and not is_good:
-            worst = model.names[int(doubtful[np.argmin(agreements[doubtful])])]
+            worst = model.averaged_names[int(doubtful[np.argmin(agreements[doubtful])])]
             yield (
                 f"model {number}: most pairs of {counted(len(doubtful), 'image')} contradict their averaged "
                 f"rotations, above all those of {worst}"
             )
-    if left_out:
-        name, reason = next(iter(left_out.items()))
-        many = f"{len(left_out)} images are in no model, {name} for one"
-        yield f"{many if len(left_out) > 1 else f'{name} is in no model'}: {reason}"
 
 
 def lost_distances(
-    known: Iterable[KnownDistance], models: Sequence[MappedModel], joined: Sequence[JoinedModel]
+    known: Iterable[KnownDistance], models: Sequence[LocateResult], joined: Sequence[JoinedModel]
 ) -> Iterator[str]:
     """Yield what became of known distances that are in no model."""
     model_of = {
-        model.located.placed.names[image]: number
+        model.placed.names[image]: number
         for number, model in enumerate(models)
-        for image in np.flatnonzero(model.located.placed.is_posed).tolist()
+        for image in np.flatnonzero(model.placed.is_posed).tolist()
     }
     for first, second, _ in known:
         ends = [model_of.get(name) for name in (first, second)]

@@ -302,7 +302,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
             Row("rigs", describe_rigs(self.refined_rigs)),
             row("control points", describe_control_points(self.control_points)),
             row("straight", describe_line(self.line_sigma)),
-            row("video", describe_loops(self.loops)),
+            row("numbered images", describe_loops(self.loops)),
         ]
 
     def expert_sentences(self) -> list[str]:

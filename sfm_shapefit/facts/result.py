@@ -13,7 +13,7 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.display import Telling, Written, report_in_notebook
 from sfm_shapefit.base.settings import flat_values
-from sfm_shapefit.base.wording import counted
+from sfm_shapefit.base.wording import counted, reasons_by_place
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.evidence import ToldEvidence, tell_evidence
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
@@ -45,7 +45,7 @@ from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.scene import Loop, told_distances
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
+from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow, Tabled
 from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import Shares, judge_model, too_few_to_judge, weigh_evidence
@@ -62,6 +62,7 @@ from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.placement.right_pairs import RightPairs, examine_right_pairs
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
 from sfm_shapefit.solver.options import SolverResult
@@ -133,9 +134,17 @@ class _Placed(Written, Tabled):
     @property
     def told(self: Any) -> Telling:
         """What the terminal says."""
-        left_out = [f"{row.name}: {row.reason}" for row in self.cameras if not row.placed]
+        left_out = reasons_by_place(self.not_placed, [row.name for row in self.cameras])
         told: Telling = self.facts.told(left_out, self.placement.refined.statement())
         return told
+
+    @property
+    def not_placed(self: Any) -> dict[str, str]:
+        """Name and reason of each camera that is placed neither here nor in another model of `map`."""
+        elsewhere = getattr(self, "elsewhere", None)
+        others = set() if elsewhere is None else {*np.array(self.images.names)[elsewhere].tolist()}
+        left_out = (row for row in self.cameras if not row.placed and row.name not in others)
+        return {row.name: row.reason for row in left_out}
 
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
@@ -229,6 +238,9 @@ class LocateResult(_Placed):
     """What the input seems to be instead of what it was read as; None if it is not."""
     join: JoinFacts | None = None
     """What came of joining it to a larger model of `map`."""
+    averaging: AveragedRotations | None = None
+    """The rotations that `map` started from, of the images `averaged_names`; None of `locate`."""
+    averaged_names: tuple[str, ...] = ()
     elsewhere: BoolArray | None = None
     """(n,) images that only another model of `map` has; they are not missing here. None without others."""
 
@@ -432,20 +444,17 @@ class LocateResult(_Placed):
         if self.scores is not None:
             columns |= {"triplet_score": self.scores[:, 0], "matched_share": self.scores[:, 1]}
             columns["pair_score"] = score_pairs(*self.scores.T)
-        if self.prior_fit is not None:
-            columns["prior_angle_deg"] = self.prior_fit.angles_deg
         added = zip(*(column.tolist() for column in columns.values()), strict=True)
-        scores = [dict(zip(columns, values, strict=True)) for values in added]
-        scores = scores or [{}] * len(self.directions.pairs)
+        scores = [MethodScores(**dict(zip(columns, values, strict=True))) for values in added]
+        scores = scores or [MethodScores()] * len(self.directions.pairs)
         usable, names, axes = self.directions.usable(), self.images.names, self.gauge.axes
         further = [piece.placement for piece in self.further]
         support = self.directions.num_inliers[usable]
-        rows = pair_rows(self.placement, support, further, [scores[k] for k in usable.tolist()])
-        of_usable = iter(rows)
-        return [
+        of_usable = iter(pair_rows(self.placement, support, further, [scores[k] for k in usable.tolist()]))
+        rows = [
             _turn(next(of_usable), axes)
             if status is DirectionStatus.USABLE
-            else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value, **given)
+            else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value, scores=given)
             for (i, j), status, support, given in zip(
                 self.directions.pairs.tolist(),
                 self.directions.status,
@@ -454,6 +463,10 @@ class LocateResult(_Placed):
                 strict=True,
             )
         ]
+        if self.prior_fit is None:
+            return rows
+        angles = self.prior_fit.angles_deg.tolist()
+        return [replace(row, prior_angle_deg=angle) for row, angle in zip(rows, angles, strict=True)]
 
     @cached_property
     def line_sigma(self) -> float | None:
@@ -471,10 +484,10 @@ class LocateResult(_Placed):
     @cached_property
     def doubtful_pairs(self) -> list[PairRow]:
         """The pairs that agree with the model and look like repeated structure all the same, worst first."""
-        doubtful = doubtful_pairs(np.array([row.pair_score for row in self.pairs])).tolist()
+        doubtful = doubtful_pairs(np.array([row.scores.pair_score for row in self.pairs])).tolist()
         rows = [row for row, is_doubtful in zip(self.pairs, doubtful, strict=True) if is_doubtful]
         used = [row for row in rows if row.verdict == Verdict.INLIER.value]
-        return sorted(used, key=lambda row: (row.pair_score, row.name1, row.name2))
+        return sorted(used, key=lambda row: (row.scores.pair_score, row.name1, row.name2))
 
 
 def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:

@@ -14,7 +14,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.placed import folder_of
-from sfm_shapefit.facts.tables import CameraRow, PairRow, name_in, write_csv
+from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow, name_in, write_csv
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.rigidity import left_out_reasons
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -164,9 +164,9 @@ def pair_rows(
     placement: Judged,
     support: IntArray,
     further: Sequence[Judged] = (),
-    scores: Sequence[Mapping[str, float]] = (),
+    scores: Sequence[MethodScores] = (),
 ) -> list[PairRow]:
-    """Return one row per pair of cameras (m,), with its number of inlier matches, and `scores` as columns.
+    """Return one row per pair of cameras (m,), with its number of inlier matches, and `scores`.
 
     Pairs of the `further` pieces that are solved are judged by these.
     """
@@ -193,14 +193,16 @@ def pair_rows(
                 name2=graph.name_of(j),
                 direction=tuple(direction),
                 support=number,
-                weight=weight,
                 residual_deg=residual_deg,
-                dual_norm=dual_norm,
-                leverage=leverage,
                 verdict=verdict.value,
                 reason=reason,
-                posterior=posterior,
-                **(scores[edge] if scores else {}),
+                scores=replace(
+                    scores[edge] if scores else MethodScores(),
+                    weight=weight,
+                    dual_norm=dual_norm,
+                    leverage=leverage,
+                    posterior=posterior,
+                ),
             )
         )
     return rows

@@ -61,19 +61,19 @@ def told_distances(known: "Sequence[KnownDistance]", images: Images) -> tuple[Di
 
 
 def describe_loops(loops: Sequence[Loop]) -> str:
-    """Say how many pairs far apart in time were taken and refused; empty where there are none."""
+    """Say how many pairs of numbered images far apart were taken and refused; empty where there are none."""
     if not loops:
         return ""
     pairs = sum(loop.num_pairs for loop in loops)
     lost = sum(loop.num_refused for loop in loops)
-    said = f"{counted(pairs, 'pair')} of frames far apart in time"
+    said = f"{counted(pairs, 'pair')} far apart in their order"
     if not lost:
-        return f"{said}, taken as the frames between say the same"
+        return f"{said}, used as the images between say the same"
     worst = max(loops, key=lambda loop: (loop.num_refused, loop.num_matches))
     are, them = ("is", "it") if lost == 1 else ("are", "them")
     return (
-        f"{said}, of which {lost} {are} not used because the frames between contradict {them}: "
-        f"above all from {_stretch(worst.first)} to {_stretch(worst.second)}"
+        f"{said}, of which {lost} {are} not used, as the images between contradict {them} "
+        f"(sequence=none uses all), above all from {_stretch(worst.first)} to {_stretch(worst.second)}"
     )
 
 

@@ -10,9 +10,9 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal, TextIO, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ from sfm_shapefit.base.atomic_folder import MARKER
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.judgement.limits import KNOWN_DEG
+from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.scene.given import Datum
 
@@ -64,27 +65,15 @@ class CameraRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PairRow:
-    """One pair that was looked at; NaN is an empty field."""
+class MethodScores:
+    """What the method computes of a pair, for who studies it; NaN is an empty field."""
 
-    name1: str
-    name2: str
-    direction: tuple[float, ...] = ()
-    """Unit direction from image 2 to image 1 in world axes (of C_1 - C_2). Columns vx, vy, vz."""
-    support: int = 0
-    """Number of inlier matches; 0 for a bare graph, which does not say."""
     weight: float = math.nan
     """Weight in the program."""
-    residual_deg: float = math.nan
-    """Angle between the direction and the solved baseline."""
     dual_norm: float = math.nan
     """||y_e|| / w_e of the certificate; below 1 for directions that the solution fits exactly."""
     leverage: float = math.nan
     """Share of its own fitted direction that it decides itself, in [0, 1]; 0 for outliers."""
-    verdict: str = Verdict.UNDETERMINED.value
-    """inlier, outlier, or undetermined."""
-    reason: str = ""
-    """Why it is undetermined."""
     triplet_score: float = math.nan
     """Weighted share of the triangles of relative rotations that close with it; only where `map` averaged and
     the pair is in a triangle. A low one is a sign of repeated structure."""
@@ -94,10 +83,30 @@ class PairRow:
     pair_score: float = math.nan
     """`triplet_score` (0.5 where there is none) times `matched_share`: the lowest of a scene are the
     likeliest to be repeated structure."""
-    prior_angle_deg: float = math.nan
-    """Angle between the direction and the baseline of the position priors, where both cameras have one."""
     posterior: float = math.nan
     """Probability that the direction is right, by its residual and by the residuals of all pairs."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairRow:
+    """One pair that was looked at; NaN is an empty field."""
+
+    name1: str
+    name2: str
+    direction: tuple[float, ...] = ()
+    """Unit direction from image 2 to image 1 in world axes (of C_1 - C_2). Columns vx, vy, vz."""
+    support: int = 0
+    """Number of inlier matches; 0 for a bare graph, which does not say."""
+    residual_deg: float = math.nan
+    """Angle between the direction and the solved baseline."""
+    verdict: str = Verdict.UNDETERMINED.value
+    """inlier, outlier, or undetermined."""
+    reason: str = ""
+    """Why it is undetermined."""
+    prior_angle_deg: float = math.nan
+    """Angle between the direction and the baseline of the position priors, where both cameras have one."""
+    scores: MethodScores = field(default=MethodScores(), repr=False)
+    """Columns under their own names."""
 
     @property
     def contradicts(self) -> bool:
@@ -118,12 +127,13 @@ def write_rows(
         write_csv(_values_of(rows, row_type, dimension), stream)
 
 
-def _values_of(
-    rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int
-) -> dict[str, list[Any]]:
+def _values_of(rows: Sequence[Any], row_type: type, dimension: int) -> dict[str, list[Any]]:
     """Return the values of each column; NaN along the axes of a vector that is not known."""
     found: dict[str, list[Any]] = {}
     for item in fields(row_type):
+        if item.name == "scores":
+            found |= _values_of([row.scores for row in rows], MethodScores, dimension)
+            continue
         values, names = [getattr(row, item.name) for row in rows], columns_of_field(item.name, dimension)
         if names == [item.name]:
             found[item.name] = values
@@ -240,6 +250,27 @@ class Tabled:
         return columns_of(getattr(self, name), _ROW_TYPES[name], self.dimension)
 
 
+class Stated(Tabled):
+    """A result with rows that says of itself what its facts say."""
+
+    __slots__ = ()
+
+    @property
+    def verdict(self: Any) -> ModelVerdict:
+        """Whether the model can be used, and why."""
+        return cast(ModelVerdict, self.facts.verdict)
+
+    @property
+    def warnings(self: Any) -> Sequence[str]:
+        """What the user should know."""
+        return cast(Sequence[str], self.facts.warnings)
+
+    @property
+    def timings_s(self: Any) -> Mapping[str, float]:
+        """Seconds of each stage."""
+        return cast(Mapping[str, float], self.facts.timings_s)
+
+
 def columns_of(
     rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type[CameraRow] | type[PairRow], dimension: int
 ) -> dict[str, Column]:
@@ -249,7 +280,7 @@ def columns_of(
         n values each: numbers are float64, or int64 and bool where none can be missing, NaN where there is
         none; texts are objects.
     """
-    kinds = {item.name: item.type for item in fields(row_type)}
+    kinds = {item.name: item.type for item in (*fields(row_type), *fields(MethodScores))}
     values = _values_of(rows, row_type, dimension)
     return {name: _column(column, kinds.get(name)) for name, column in values.items()}
 

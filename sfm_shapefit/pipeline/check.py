@@ -87,7 +87,7 @@ def _map_anew(
             mapped = map_opened(file, MapOptions(), clock)
         except UnsolvableError:
             return None
-    models = [model.located for model in mapped.models]
+    models = mapped.models
     number = max(range(len(models)), key=lambda k: _num_common(posed.images, models[k].placed))
     best = models[number]
     doubted = np.zeros(best.placed.num_images, dtype=np.bool_)

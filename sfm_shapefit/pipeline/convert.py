@@ -60,7 +60,7 @@ def convert(
     overwrite: bool = False,
     crs: str = "",
     offset: str = "",
-) -> str:
+) -> Path:
     """Write the posed images of a model in another format.
 
     Args:
@@ -75,13 +75,13 @@ def convert(
             *_offset.xyz beside the file, in offset.xyz in a folder.
 
     Returns:
-        The format that was written.
+        The file or folder that was made; others stand beside it.
 
     Raises:
         InputError: if the source cannot be read, the format cannot hold it, the target exists already, or
             the model cannot be brought to the system.
     """
-    return write_converted(source, Path(target), target_format, overwrite, (crs, offset)).format
+    return write_converted(source, Path(target), target_format, overwrite, (crs, offset)).files[0]
 
 
 class Converted(NamedTuple):
@@ -103,6 +103,7 @@ def write_converted(
 ) -> Converted:
     """Write a model in another format, in a system and with an offset; `convert` raises the same."""
     # Here, so that the command line knows the formats without loading pycolmap.
+    from sfm_shapefit.base.paths import refuse_absent
     from sfm_shapefit.facts.tables import model_datum
     from sfm_shapefit.files.colmap.listed_poses import read_by_itself
     from sfm_shapefit.files.colmap.model import model_of, read_model
@@ -113,7 +114,8 @@ def write_converted(
     name = target_format or _format_of(path)
     if name not in FORMATS:
         raise InputError(f"{name!r} is no format to write; give one of {', '.join(FORMATS)}")
-    protect = [source] if isinstance(source, Path | str) else []
+    protect = [Path(source)] if isinstance(source, Path | str) else []
+    refuse_absent(*protect)
     if name not in _FOLDERS:
         refuse_file(path, overwrite=overwrite, protect=protect)
     given, source = source, model_of(source)

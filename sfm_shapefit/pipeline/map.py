@@ -54,8 +54,9 @@ def map_database(
         executor: shares out pairs among its workers, as of `locate`. None: all is done here.
 
     Returns:
-        `models`, most cameras first, each with `located` (see `locate`), the rotations it started from and
-        how they were chosen; `left_out`, the reason for each image in no model; `warnings`.
+        `models`, most cameras first, each as `locate` returns it, with the rotations that it started from as
+        its `averaging`; `left_out`, the reason for each image in no model; `warnings`. Cameras, pairs,
+        verdict and report are those of the first model.
 
     Raises:
         InputError: if the database cannot be used; the message says what to do.
@@ -100,7 +101,7 @@ def map_opened(
         warnings=(
             *file.notes,
             *(run.known.priors.notes if run.known.priors is not None else ()),
-            *map_warnings(run.read.rigs.incomplete, models, left_out),
+            *map_warnings(run.read.rigs.incomplete, models),
             *join_warnings,
             *lost_distances(run.options.gauge.known_distance, models, joined),
         ),

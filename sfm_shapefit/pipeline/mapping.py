@@ -12,7 +12,7 @@ from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.joins import Joined
-from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
+from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.scene import Loop
 from sfm_shapefit.files.colmap.model import read_model
@@ -66,12 +66,12 @@ def _place_first(inputs: RunInputs, source: MatchSource, clock: Clock) -> Estima
 
 def locate_components(
     run: MapContext, relative: RelativeRotations, visits: Sequence[Visit], reasons: dict[int, str]
-) -> list[MappedModel]:
+) -> list[LocateResult]:
     """Return a model of each component that can be placed, most cameras first.
 
     Why a frame belongs to none is written to `reasons`, which starts with one for each.
     """
-    models: list[MappedModel] = []
+    models: list[LocateResult] = []
     for frames, members, averaging in run.average_images(relative, reasons):
         try:
             located = _locate_component(run, members, averaging, relative)
@@ -79,29 +79,30 @@ def locate_components(
             reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
         names = tuple(run.images.names[k] for k in members.tolist())
-        located = replace(located, loops=tuple(_loops_of(visits, run.images.names, set(names))))
-        component = MappedModel(located=located, averaging=averaging, names=names)
-        models += _rigid_models(component, run.options.averaging.min_model_size)
+        loops = tuple(_loops_of(visits, run.images.names, set(names)))
+        found = replace(located, loops=loops, averaging=averaging, averaged_names=names)
+        models += _rigid_models(found, run.options.averaging.min_model_size)
         for k in frames.tolist():
             del reasons[k]
-    return sorted(models, key=lambda model: -int(model.located.kept.sum()))
+    return sorted(models, key=lambda model: -int(model.kept.sum()))
 
 
-def _rigid_models(component: MappedModel, least: int) -> Iterator[MappedModel]:
+def _rigid_models(first: LocateResult, least: int) -> Iterator[LocateResult]:
     """Yield the model of a component, and those of its further rigid pieces with so many cameras.
 
     Pairs between two pieces tell no scale; a join of the two models may.
     """
-    first = component.located
+    averaging, names = first.averaging, first.averaged_names
+    assert averaging is not None
     large = [piece for piece in first.further if int(piece.kept.sum()) >= least]
     rest = tuple(piece for piece in first.further if piece not in large)
     placed = np.any([piece.placed.is_posed for piece in (first, *large)], axis=0)
     first, *large = (replace(one, elsewhere=placed & ~one.placed.is_posed) for one in (first, *large))
-    yield replace(component, located=replace(first, further=rest))
+    yield replace(first, further=rest)
     for piece in large:
         rows = np.sort(piece.placement.cameras)
-        names = tuple(component.names[k] for k in rows.tolist())
-        yield MappedModel(located=piece, averaging=component.averaging.subset(rows), names=names)
+        some = tuple(names[k] for k in rows.tolist())
+        yield replace(piece, averaging=averaging.subset(rows), averaged_names=some)
 
 
 def _locate_component(
@@ -164,7 +165,7 @@ def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) ->
 
 
 def join_mapped(
-    models: Sequence[MappedModel], run: MapContext
+    models: Sequence[LocateResult], run: MapContext
 ) -> tuple[tuple[Joined, ...], tuple[JoinedModel, ...], tuple[str, ...]]:
     """Join the models of a run, largest first, where that is safe and wanted.
 
@@ -174,7 +175,7 @@ def join_mapped(
     """
     if len(models) < 2 or run.options.join == "never":
         return (), (), ()
-    located = {number: model.located for number, model in enumerate(models)}
+    located = dict(enumerate(models))
     pieces = [
         ModelPiece(
             label=f"model {number}",

@@ -34,7 +34,7 @@ from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, fit_pairs
@@ -70,7 +70,7 @@ _ROUNDING = 1e-9  # share of the largest coordinate; cameras no farther apart st
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class CheckResult(Reported, Tabled):
+class CheckResult(Reported, Stated):
     """The verdict on a model, with the evidence for it."""
 
     model: ColmapModel
@@ -88,11 +88,6 @@ class CheckResult(Reported, Tabled):
     def reconstruction(self) -> "pycolmap.Reconstruction":
         """The model as read, so that the result serves as a model."""
         return self.model.reconstruction
-
-    @property
-    def verdict(self) -> ModelVerdict:
-        """Whether the model can be used, and why."""
-        return self.facts.verdict
 
     @cached_property
     def drawing(self) -> "Drawing":
@@ -209,7 +204,7 @@ def compare_with_other(state: CheckState) -> CheckState:
     second = compare_models(images, fits, other.images, other.fits, other.doubted)
     if second is None:
         return state
-    grade = other.source.models[other.number].located.verdict.grade
+    grade = other.source.models[other.number].verdict.grade
     second = second._replace(grade=grade, folder=str(other.number))
     elsewhere = [*second.wrong, *second.undecided]
     if len(elsewhere) == 1:  # several that are wrong together see false points together

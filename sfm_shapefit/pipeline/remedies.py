@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.judgement.wrong_lenses import is_like_others
@@ -53,10 +54,10 @@ class Remedy(NamedTuple):
             sigmas[row] = np.maximum(sigmas[row], sigma)
         result = replace(result, intrinsics=replace(result.intrinsics, focal_sigmas=sigmas))
         ids = {result.placed.lenses[row].id for row in self.freed}
-        lenses = (row.statement for row in result.intrinsics.rows(result.placed) if row.camera in ids)
-        done = [
-            f"{lens}: its images contradicted what was given, unless --intrinsics held" for lens in lenses
-        ]
+        lenses = [row for row in result.intrinsics.rows(result.placed) if row.camera in ids]
+        changed = "; ".join(describe_intrinsics(lenses))
+        why = "images contradicted what was given, unless --intrinsics held"
+        done = [f"{changed}: {why}"] if lenses else []
         if self.moved:
             done.append(f"{', '.join(self.moved)}: placed without the pairs that twice as many contradict")
         return replace(result, warnings=(*done, *result.warnings))

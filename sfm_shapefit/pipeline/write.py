@@ -66,7 +66,7 @@ def write_result(
     *,
     options: WriteOptions | None = None,
     **overrides: Any,
-) -> None:
+) -> Path:
     """Write a result into a folder that appears whole or not at all: models, tables, a page for each.
 
     Args:
@@ -75,10 +75,14 @@ def write_result(
         options: settings, see `help(WriteOptions)`; defaults if None.
         **overrides: single options by name: `write_result(found, "out", overwrite=True)`.
 
+    Returns:
+        The folder.
+
     Raises:
         InputError: if the folder exists, cannot be written, or would hit a protected path.
     """
     deliver(found, out, merge_options(options, WriteOptions, overrides))
+    return Path(out)
 
 
 def deliver(found: Result, out: Path | str, options: WriteOptions) -> Result:
@@ -89,7 +93,7 @@ def deliver(found: Result, out: Path | str, options: WriteOptions) -> Result:
     kept = MADE_FIRST if made else ()
     with atomic_folder(out, overwrite=options.overwrite, protect=protect, kept=kept) as folder:
         if isinstance(found, MapResult):
-            models = {str(number): model.located for number, model in enumerate(found.models)}
+            models = {str(number): model for number, model in enumerate(found.models)}
             for name, one in (models | {joined.folder: joined for joined in found.joined}).items():
                 (folder / name).mkdir()
                 _write_files(one, folder / name, options)
@@ -103,7 +107,7 @@ def has_colors(found: LocateResult | GraphResult | MapResult | JoinedModel) -> b
     """Return whether points of a result, of several models the largest, have colors; none need no color."""
     if isinstance(found, GraphResult):
         return True
-    shown = found.models[0].located if isinstance(found, MapResult) else found
+    shown = found.models[0] if isinstance(found, MapResult) else found
     picked = pick_points(shown.model if isinstance(shown, LocateResult) else shown.reconstruction, _PICKED)
     return not picked.num_all or bool(picked.colors.any())
 
@@ -138,7 +142,7 @@ def with_colors(found: Result, images: Path | str) -> Result:
 def _colored(found: Any, pictures: PictureFolder, unread: set[str]) -> Any:
     """Return a result with colors; names of unreadable pictures are added to `unread`."""
     if isinstance(found, MapResult):
-        models = [replace(one, located=_colored(one.located, pictures, unread)) for one in found.models]
+        models = [_colored(one, pictures, unread) for one in found.models]
         joined = [_colored(one, pictures, unread) for one in found.joined]
         return replace(found, models=tuple(models), joined=tuple(joined))
     if isinstance(found, JoinedModel):
@@ -209,8 +213,8 @@ def _write_cameras(rows: Sequence[CameraRow], dimension: int, folder: Path) -> N
 
 def write_page(
     found: Reported, page: Path | str, *, images: Path | str = "", overwrite: bool = False
-) -> None:
-    """Write the report of a result to a file; see `Reported.report`."""
+) -> Path:
+    """Write the report of a result to a file, and return it; see `Reported.report`."""
     refuse_file(
         Path(page), overwrite=overwrite, protect=[*_inputs_of(found), *([images] if str(images) else [])]
     )
@@ -218,6 +222,7 @@ def write_page(
         has_pictures = _write_report(found, partial, images)
     if not has_pictures:
         raise InputError(f"{images} has none of the images, so {page} has no pictures")
+    return Path(page)
 
 
 def refuse_file(page: Path, *, overwrite: bool, protect: Iterable[Path | str] = ()) -> None:
@@ -288,7 +293,7 @@ def _write_report(found: Any, page: Path, images: Path | str) -> bool:
     from sfm_shapefit.report.page import write_report
     from sfm_shapefit.report.thumbnails import read_thumbnails
 
-    shown = found.models[0].located if isinstance(found, MapResult) else found
+    shown = found.models[0] if isinstance(found, MapResult) else found
     drawing = _drawing_of(shown)
     cameras = drawing.cameras
     pictures = read_thumbnails(Path(images), cameras.names, cameras.trust) if str(images) else None

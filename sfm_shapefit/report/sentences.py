@@ -22,7 +22,7 @@ from sfm_shapefit.report.drawing import Drawing, PairClass
 MAX_TEXT = 160  # characters of a name or sentence that are shown; strangers may write longer ones
 _SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 _FEW_PAIRS = 4  # contradicting pairs; that most are of one camera says nothing where there are fewer
-_HAVE_TABLES = {"intrinsics", "control points", "video"}
+_HAVE_TABLES = {"intrinsics", "control points", "numbered images"}
 _SHOWN = 3  # items of a kind among the first things to look at; the tables have all
 _MOST_WEAK = 6  # weak cameras among these; the table of cameras has all
 

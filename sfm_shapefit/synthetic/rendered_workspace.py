@@ -11,6 +11,7 @@ of the exact model are those surface points, joined along right matches. On the 
 is the same on every run, byte by byte.
 """
 
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
@@ -65,7 +66,10 @@ class JudgedMatches(NamedTuple):
 
 
 def write_rendered_workspace(
-    scene: RenderedScene, out: Path, options: WorkspaceOptions | None = None
+    scene: RenderedScene,
+    out: Path,
+    options: WorkspaceOptions | None = None,
+    progress: Callable[[str, int, int], None] = lambda _stage, _done, _total: None,
 ) -> None:
     """Draw a scene and run COLMAP's feature detection, matching and verification on the images.
 
@@ -75,14 +79,17 @@ def write_rendered_workspace(
             written.
         options: what stands in it; the defaults if None. Without `database` nothing is matched, and the model
             has poses but no points.
+        progress: called with a stage, the work done so far and the work in all.
     """
     options = options or WorkspaceOptions()
     with workspace_folder(out) as workspace:
         (workspace / "images").mkdir()
         for k, image in enumerate(encode_images(scene)):
             (workspace / "images" / image_name(k)).write_bytes(image)
+            progress("images", k + 1, scene.num_images)
         judged = None
         if options.database:
+            progress("features and matches", 0, 1)
             _match_images(scene, workspace, relative_poses=options.relative_poses)
             judged = judge_matches(scene, workspace / "database.db", scene.options.min_matches)
         write_models(_parts(scene, judged), workspace, options.model)

@@ -103,6 +103,59 @@ def test_other_commands_take_colmaps_names_of_paths_too(tmp_path):
     assert "missing.db does not exist" in run_refused("map", *names)
 
 
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [
+        ("mapper --database_path a", "mapper is COLMAP's; here it is sfm-shapefit map DATABASE OUT"),
+        ("model_comparer --input_path1 a", "here it is sfm-shapefit evaluate MODEL REF"),
+        ("map a b --Mapper.ba_refine_focal_length 0", "here it is --intrinsics held, focal or all"),
+        ("map a b --GlobalMapper.min_num_matches=30", "here it is min_matches = ... in the file of --config"),
+        ("map a b --SiftExtraction.max_num_features 9", "here it is --max-num-features"),
+        ("map a b --GlobalMapper.keep_max_num_tracks 9", "this command has nothing like it; leave it out"),
+        ("check a --Mapper.num_threads 3", "this command has nothing like it; leave it out"),
+        ("map a b --project_path x.ini", "here it is --config FILE, in TOML"),
+        ("locate a b --ba_gpu_index 0", "no GPU is used, so leave it out"),
+        ("join --input_path1 a --input_path2 b", "here paths go by their place, without a flag"),
+        ("locate a b --min_model_size 4", "--min_model_size is an option of map"),
+        ("map a b --sequence none", "--sequence is a key of --config: sequence = ..."),
+    ],
+)
+def test_what_colmap_has_and_we_have_not_is_answered_with_what_it_is_here(typed, words):
+    assert words in " ".join(run(*typed.split(), code=2).stderr.split())
+
+
+def test_flags_are_understood_with_underscores_too(tmp_path):
+    flags = ("--min_trust=0.25", "--no_report", "--known_distance", "0001.jpg", "0002.jpg", "3")
+    told = json.loads(run("locate", RING_MODEL, tmp_path / "out", *flags, "--json", code=0).stdout)
+    assert told["options"]["min_trust"] == 0.25
+    assert told["options"]["known_distance"] == [["0001.jpg", "0002.jpg", 3.0]]
+    assert not (tmp_path / "out" / "report.html").exists()
+
+
+def test_what_is_wrong_with_the_input_is_said_before_what_is_wrong_with_the_output(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("out/mine", "empty/none.txt", "words.db"):
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_text("mine")
+    before = fingerprint(tmp_path)
+    for typed, words in (
+        ("map nosuch.db out", "nosuch.db does not exist"),
+        ("map words.db out", "words.db is not a COLMAP database"),
+        ("map empty out", "empty is a folder without a database.db that holds no image"),
+        ("locate nosuch out", "nosuch does not exist"),
+        (f"locate {RING_MODEL} out --priors nosuch.csv", "nosuch.csv does not exist"),
+        (f"join {RING_MODEL} nosuch out", "nosuch does not exist"),
+        (f"join {RING_MODEL} empty out", "empty holds no COLMAP model"),
+        ("place nosuch.txt out", "nosuch.txt does not exist"),
+        ("workspace nosuch empty out", "nosuch does not exist"),
+        ("convert nosuch words.db --format tum", "nosuch does not exist"),
+        ("evaluate nosuch out --csv words.db", "nosuch does not exist"),
+        ("check nosuch --report words.db", "nosuch does not exist"),
+    ):
+        assert words in run_refused(*typed.split()), typed
+    assert fingerprint(tmp_path) == before
+
+
 def test_paths_given_twice_or_not_at_all_are_wrong_usage(tmp_path):
     run("locate", RING_MODEL, code=2)
     run("locate", RING_MODEL, tmp_path / "out", "--output_path", tmp_path / "o", code=2)
@@ -246,6 +299,20 @@ def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
     (tmp_path / "options.toml").write_text(text)
     run("locate", FACADE_MODEL, tmp_path / "out", "--config", tmp_path / "options.toml", code=2)
     assert not (tmp_path / "out").exists()
+
+
+def test_what_is_wrong_in_a_config_file_is_said_with_its_name_and_tables_are_known_too(tmp_path):
+    config, flags = tmp_path / "options.toml", ("--config", tmp_path / "options.toml")
+    for text, words in (
+        ("min_trust = 'a'", "options.toml: min_trust must be a number"),
+        ("[direction]\nmin_inliers = 9", "'direction' is no option; did you mean directions?"),
+    ):
+        config.write_text(text)
+        said = run("locate", RING_MODEL, tmp_path / "out", *flags, code=2).stderr
+        assert words in " ".join(said.split())
+    config.write_text("min_trust = 0.5")
+    said = run("locate", RING_MODEL, tmp_path / "out", *flags, "--min-trust", "7", code=2).stderr
+    assert "options.toml: " not in said
 
 
 def test_a_config_file_sets_options_and_flags_win(tmp_path):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 
@@ -18,12 +19,11 @@ from sfm_shapefit import locate
 from sfm_shapefit.base.display import Row, Telling
 from sfm_shapefit.base.kernel_cache import counted_as_compiling, measure_compilation
 from sfm_shapefit.cli import console
-from sfm_shapefit.cli.console import show_progress
 from sfm_shapefit.cli.flags import OutputFlags
 from sfm_shapefit.cli.frame import Run
 from sfm_shapefit.files.colmap import model
 from sfm_shapefit.files.colmap.quiet import quiet_log
-from tests.program import run
+from tests.program import run, run_python
 from tests.scenes import FACADE, RING, ROOT
 
 
@@ -72,34 +72,52 @@ def test_tracks_of_a_model_are_counted_by_pairs_and_the_solve_by_iterations():
     assert {limit for _, limit in iterations} == {100}  # of Newton steps; see `solver.solve`
 
 
-def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed_and_elsewhere_there_are_none(capfd):
-    """A stage that ends before its limit, as a solve does, shows the steps that it took."""
-    code = (
-        "from sfm_shapefit.cli.console import show_progress\n"
-        "with show_progress(True) as progress:\n"
-        "    progress('solve', 0, 1)\n"
-        "    for k in range(1, 8):\n"
-        "        progress('solve', k, 100)\n"
-        "    progress('solve', 1, 1)\n"
-    )
+RUN = """
+import time
+from sfm_shapefit.cli.progress import show_progress
+with show_progress(True, {how}) as hear:
+    hear("solve", 0, 1)
+    for k in range(1, 9):
+        hear("solve", k, 100)
+        time.sleep({pause})
+    hear("solve", 1, 1)
+    hear("trust", 0, 1)
+    hear("trust", 1, 1)
+"""
+
+
+def shown_on_a_terminal(code: str, **environment: str) -> list[str]:
+    """Return what a program writes on stderr, a terminal of 80 columns, by what it draws over."""
     master, terminal = os.openpty()
-    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stderr=terminal)
+    env = os.environ | {"TERM": "xterm", "COLUMNS": "80"} | environment
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stderr=terminal, env=env)
     os.close(terminal)
     shown = b""
-    while True:
-        try:
-            chunk = os.read(master, 4096)
-        except OSError:  # the terminal's other end is closed
-            break
-        shown += chunk
-        if not chunk:
-            break
+    with suppress(OSError):  # the terminal's other end is closed
+        while chunk := os.read(master, 4096):
+            shown += chunk
     os.close(master)
     assert process.wait() == 0
-    assert re.findall(rb"(\d+) of (\d+)", shown)[-1] == (b"7", b"7")
-    with show_progress(enabled=True) as progress:
-        assert progress is None
-    assert capfd.readouterr().err == ""
+    return shown.decode().split("\r")
+
+
+@pytest.mark.parametrize("environment", [{}, {"COLUMNS": "40", "NO_COLOR": "1"}])
+def test_a_terminal_has_one_line_of_progress_with_what_is_left_and_nothing_of_it_at_the_end(environment):
+    drawn = shown_on_a_terminal(RUN.format(how="", pause=0.3), **environment)
+    plain = [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", one) for one in drawn]
+    assert not any("\n" in one.strip() for one in plain)  # never more than one line
+    assert all(len(one.strip()) <= int(environment.get("COLUMNS", 80)) for one in plain)
+    if "COLUMNS" not in environment:
+        assert any(re.match(r"solve .* \d of 100, about \d+ s left \(\d s so far\)", one) for one in plain)
+    assert ("\x1b[9" in "".join(drawn)) == ("NO_COLOR" not in environment)
+    assert drawn[-1].endswith("\x1b[2K")  # the line is erased
+
+
+@pytest.mark.parametrize("how", ["verbose=True", "patience_s=0.0"])
+def test_without_a_terminal_a_short_run_says_nothing_and_a_long_one_a_line_for_each_stage(how):
+    assert run_python("-c", RUN.format(how="", pause=0.0)).stderr == ""
+    told = run_python("-c", RUN.format(how=how, pause=0.0)).stderr.splitlines()
+    assert told == ["sfm-shapefit: solve", "sfm-shapefit: trust"]
 
 
 @pytest.mark.parametrize("verbose", [False, True])

@@ -15,11 +15,14 @@ from sfm_shapefit.facts.intrinsics import (
 )
 from sfm_shapefit.scene.lens import Lens, Origin
 
+HEAD = "camera 1 (1.jpg and 3 more): focal length 1,000.0 px (a guess)"
+
 
 def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, num_images=4):
     """A row of locate.json."""
     return CameraIntrinsics(
         camera=camera,
+        image=f"{camera}.jpg",
         num_images=num_images,
         model="SIMPLE_RADIAL",
         origin=Origin.GUESS.value,
@@ -37,26 +40,27 @@ def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, 
     [
         (
             row(),
-            "camera 1: focal length 1,000.0 px (a guess) became 1,100.0 ± 5.0 px (+10.0%) by adjustment, "
-            "distortion -0.0500",
+            f"{HEAD} became 1,100.0 ± 5.0 px (+10.0%) by adjustment, distortion -0.0500",
         ),
         (
             row(decided_by="view graph", sigma=None),
-            "camera 1: focal length 1,000.0 px (a guess) became 1,100.0 px (+10.0%) by the view graph",
+            f"{HEAD} became 1,100.0 px (+10.0%) by the view graph",
         ),
         (
             row(decided_by="undetermined", found=1000.0, sigma=None),
-            "camera 1: focal length 1,000.0 px (a guess) kept, as the matches do not determine it",
+            f"{HEAD} kept, as the matches do not determine it",
         ),
         (
             replace(
                 row(decided_by="undetermined", found=1000.0, sigma=None),
                 parameters=[1000.0, 600.0, 450.0, -0.05],
             ),
-            "camera 1: focal length 1,000.0 px (a guess) kept, as the matches do not determine it, "
-            "distortion -0.0500",
+            f"{HEAD} kept, as the matches do not determine it, distortion -0.0500",
         ),
-        (row(decided_by="held", found=1000.0), "camera 1: focal length 1,000.0 px (a guess) kept"),
+        (
+            row(decided_by="held", found=1000.0),
+            f"{HEAD} kept",
+        ),
     ],
 )
 def test_each_of_few_cameras_is_told(one, sentence):
@@ -70,9 +74,9 @@ def test_many_cameras_are_told_in_one_sentence():
     rows += [row(9, "undetermined", found=1000.0), row(10, "held", found=1000.0)]
     (line,) = describe_intrinsics(rows)
     assert line == (
-        "3 of 5 cameras in doubt have another focal length now, by +10.0% to +30.0% (median +20.0%); 1 kept "
-        "the given one, as the matches do not determine it; 1 were not to be changed; each stands in "
-        "locate.json"
+        "3 of 5 cameras in doubt have another focal length now, by +10.0% to +30.0% (median +20.0%), most "
+        "that of camera 3 (3.jpg and 3 more); 1 kept the given one, as the matches do not determine it; 1 "
+        "were not to be changed; each stands in locate.json"
     )
 
 
@@ -108,12 +112,15 @@ def test_what_adjustments_leave_open_is_held_from_then_on_and_warned_of():
     rows = [row(1), row(2, "undetermined"), replace(row(3, "undetermined"), origin="given")]
     (warning,) = intrinsics_warnings(rows)  # what was calibrated needs none
     assert warning.startswith(
-        "camera 2 kept a focal length that was never measured, which the matches do not"
+        "camera 2 (2.jpg and 3 more) kept a focal length that was never measured, which the matches do not"
     )
 
 
 def test_cameras_whose_focal_length_is_hardly_known_are_named():
     rows = [row(1, sigma=10.0), row(2, sigma=12.0), row(3, sigma=None), row(4, "view graph", sigma=None)]
     (warning,) = intrinsics_warnings(rows)
-    assert warning.startswith("the matches hardly tell the focal length of cameras 2, 3 (± 1% or more), so")
+    assert warning.startswith(
+        "the matches hardly tell the focal length of camera 2 (2.jpg and 3 more), camera 3 (3.jpg and 3 "
+        "more) (± 1% or more), so"
+    )
     assert list(intrinsics_warnings([*rows[:1], replace(rows[1], origin="given")])) == []

@@ -93,6 +93,6 @@ def test_own_tracks_repeat_nothing():
     ("rigs", "told"), [((4,), "rig 4 of the database is not used"), ((4, 7), "2 rigs, rig 4 of the database")]
 )
 def test_rigs_that_are_not_calibrated_are_counted_and_the_cure_is_told(rigs, told):
-    (warning,) = map_warnings(rigs, [], {})
+    (warning,) = map_warnings(rigs, [])
     assert warning.startswith(told)
     assert "colmap rig_configurator" in warning

@@ -109,7 +109,7 @@ def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_
 def test_what_map_doubts_check_does_not_call_good():
     """Houses look the same: matches speak for another rotation of two cameras, too."""
     mapped = map_database(PHOTOGRAPHED / "database.db")
-    doubted = mapped.models[0].located.verdict.cameras
+    doubted = mapped.models[0].verdict.cameras
     assert doubted
     for model in (mapped, PHOTOGRAPHED / "truth"):
         found = check(model, PHOTOGRAPHED / "database.db", second_opinion=mapped)
@@ -127,10 +127,10 @@ def test_what_map_doubts_check_does_not_call_good():
 
 
 def test_a_camera_that_has_two_places_in_the_other_model_is_not_confirmed(courtyard_mapped):
-    located = courtyard_mapped.models[0].located
+    located = courtyard_mapped.models[0]
     place = OtherPlace(4, 3, 5, np.ones(3), np.zeros((3, 2), dtype=int))
     doubtful = replace(located, evidence=ModelEvidence(places=(place,)))
-    other = replace(courtyard_mapped, models=(replace(courtyard_mapped.models[0], located=doubtful),))
+    other = replace(courtyard_mapped, models=(doubtful,))
     found = check(COURTYARD / "truth", COURTYARD / "database.db", second_opinion=other)
     assert found.facts.evidence.second.ambiguous == found.verdict.cameras == (located.placed.names[4],)
 

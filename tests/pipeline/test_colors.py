@@ -77,7 +77,7 @@ def test_missing_and_broken_pictures_are_told_and_points_have_the_colors_of_the_
 
 
 def test_colors_of_the_input_stay_and_a_model_that_the_user_changed_is_colored_as_it_is(pictures, tmp_path):
-    found = sfm_shapefit.map_database(RING / "database.db").models[0].located
+    found = sfm_shapefit.map_database(RING / "database.db").models[0]
     model = pycolmap.Reconstruction(found.reconstruction)
     for point in model.points3D.values():
         point.color = np.array([1, 2, 3], dtype=np.uint8)
@@ -86,7 +86,7 @@ def test_colors_of_the_input_stay_and_a_model_that_the_user_changed_is_colored_a
     kept = colors_of(pycolmap.Reconstruction(tmp_path / "kept"))
     assert (1, 2, 3) in kept.values()
     assert (0, 0, 0) not in kept.values()
-    found = sfm_shapefit.map_database(RING / "database.db").models[0].located
+    found = sfm_shapefit.map_database(RING / "database.db").models[0]
     gone = min(found.reconstruction.point3D_ids())
     found.reconstruction.delete_point3D(gone)
     found.write(tmp_path / "changed", images=pictures)

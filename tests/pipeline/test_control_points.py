@@ -84,7 +84,7 @@ def test_the_model_stands_where_the_points_are_and_check_points_say_so(ring, tmp
 
 def test_map_stands_where_the_points_are(ring, tmp_path):
     path = written(tmp_path, marks_of(ring, CORNERS))
-    found = sfm_shapefit.map_database(RING / "database.db", control_points=path).models[0].located
+    found = sfm_shapefit.map_database(RING / "database.db", control_points=path).models[0]
     for name, center in centers_of(found.reconstruction).items():
         true = WORLD.apply(ring.find_image_with_name(name).projection_center()[None])[0]
         np.testing.assert_allclose(center, true, atol=1e-3)

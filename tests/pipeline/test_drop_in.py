@@ -53,7 +53,7 @@ def test_a_result_serves_wherever_a_model_does(tmp_path, ring_located, ring_mapp
     checked = sfm_shapefit.check(found, second_opinion=mapped)
     assert checked.facts.inputs.database == str(found.database)  # not the tracks, which agree more easily
     assert sfm_shapefit.inspect(found).num_images == 8
-    assert sfm_shapefit.convert(found, tmp_path / "poses.csv") == "csv"
+    assert sfm_shapefit.convert(found, tmp_path / "poses.csv") == tmp_path / "poses.csv"
     assert len(sfm_shapefit.bundle_adjust(found).frame_ids) == 8
     assert sfm_shapefit.locate(found).reconstruction.num_reg_images() == 8
     assert sfm_shapefit.evaluate(mapped, found).position.max < 1e-4
@@ -74,17 +74,42 @@ def test_results_write_themselves_and_show_at_most_twenty_attributes(tmp_path, r
         assert len(dir(result)) <= 20
         assert all(hasattr(result, name) for name in dir(result))
         assert not any(name.startswith("_") for name in dir(result))
-    found.write(tmp_path / "out")
-    mapped.write(tmp_path / "models", report=False)
+    assert found.write(tmp_path / "out") == tmp_path / "out"
+    assert mapped.write(str(tmp_path / "models"), report=False) == tmp_path / "models"
     assert pycolmap.Reconstruction(tmp_path / "out").num_reg_images() == 8
     assert not (tmp_path / "models/0/report.html").exists()
     found.reconstruction.deregister_frame(found.reconstruction.image(1).frame_id)
     found.write(tmp_path / "out", overwrite=True)
     assert pycolmap.Reconstruction(tmp_path / "out").num_reg_images() == 7
     for name, result in {"found": found, "mapped": mapped, "checked": checked}.items():
-        result.report(tmp_path / f"{name}.html")
+        assert result.report(tmp_path / f"{name}.html") == tmp_path / f"{name}.html"
         assert "report" in (tmp_path / f"{name}.html").read_text(encoding="utf-8")
         with pytest.raises(InputError, match="exists already"):
             result.report(tmp_path / f"{name}.html")
     with pytest.raises(InputError, match="none of the images"):
         found.report(tmp_path / "pictures.html", images=tmp_path)
+
+
+def test_a_result_of_map_has_what_its_largest_model_has_and_each_model_is_as_of_locate(ring_mapped):
+    (model,) = ring_mapped.models
+    assert isinstance(model, sfm_shapefit.LocateResult)
+    assert (ring_mapped.cameras, ring_mapped.pairs) == (model.cameras, model.pairs)
+    assert ring_mapped.verdict.grade == model.verdict.grade == "good"
+    assert list(ring_mapped.table("cameras")["name"]) == [row.name for row in model.cameras]
+    assert model.averaging.registered.all()
+    assert sfm_shapefit.evaluate(ring_mapped, RING / "sparse" / "0").position.max < 1e-3
+    assert max(len(repr(one)) for one in (ring_mapped, model)) < 80
+
+
+def test_what_only_the_method_needs_of_a_pair_stands_apart_and_in_the_table(ring_mapped, tmp_path):
+    pair = ring_mapped.pairs[0]
+    assert "scores" not in repr(pair)
+    assert 0.0 < pair.scores.posterior <= 1.0
+    columns = ring_mapped.table("pairs")
+    ring_mapped.write(tmp_path / "out", report=False)
+    header = (tmp_path / "out" / "0" / "pairs.csv").read_text().splitlines()[0].split(",")
+    assert list(columns) == header
+    scores = {"weight", "dual_norm", "leverage", "triplet_score", "matched_share", "pair_score", "posterior"}
+    assert scores <= {*header}
+    assert columns["posterior"][0] == pair.scores.posterior
+    assert columns["posterior"].dtype == float

@@ -54,7 +54,10 @@ def test_a_wrong_lens_that_is_held_is_named_with_the_right_focal_length():
     assert told.asked_focal_px == pytest.approx(right_px, rel=0.01)
     assert name in found.verdict.cameras
     assert found.verdict.grade is Grade.LOOK
-    assert sum(f"focal length of camera {wrong_id} is wrong" in warning for warning in found.warnings) == 1
+    assert (
+        sum(f"focal length of camera {wrong_id} ({name}) is wrong" in warning for warning in found.warnings)
+        == 1
+    )
     assert found.summary()["evidence"]["lenses"][0]["camera"] == wrong_id
 
 
@@ -124,11 +127,11 @@ def test_halves_that_two_pairs_tie_are_doubted_where_what_tied_them_was_rejected
     tmp_path, halves
 ):
     wrong = halves
-    (told,) = wrong.models[0].located.told_evidence.untied
+    (told,) = wrong.models[0].told_evidence.untied
     assert told.images == tuple(f"{k:04d}.jpg" for k in range(1, 13))
     assert (told.num_agreeing, told.num_points, told.is_loose) == (1, 0, True)
-    assert told.statement in wrong.models[0].located.warnings
-    unknown = {row.name for row in wrong.models[0].located.cameras if not np.isfinite(row.sigma).all()}
+    assert told.statement in wrong.models[0].warnings
+    unknown = {row.name for row in wrong.models[0].cameras if not np.isfinite(row.sigma).all()}
     assert unknown == set(told.images)
     assert wrong.verdict.grade is Grade.DO_NOT_USE
     right = sfm_shapefit.map_database(cut(tmp_path, (4, 25), (5, 24)))
@@ -185,7 +188,7 @@ def test_points_are_lost_that_only_a_pair_carries_whose_matches_mostly_see_two_p
 
 
 def test_halves_that_a_join_ties_are_not_doubted(halves):
-    model = read_model(halves.models[0].located.reconstruction)
+    model = read_model(halves.models[0].reconstruction)
     joined = np.flatnonzero(np.isin(model.images.ids, [1, 2, 13, 14]))
     clock = Clock.of(None)
     with open_source(model, inputs_from(halves.database)) as source:
@@ -220,3 +223,16 @@ def test_a_displaced_camera_has_its_other_place_with_both_counts(tmp_path, court
     assert told.num_there > 2 * told.num_here
     assert f"{told.num_there} put it 2" in told.statement
     assert image.name in facts.verdict.cameras
+
+
+def test_several_wrong_lenses_are_one_line_with_the_names_of_their_images():
+    truth = pycolmap.Reconstruction(COURTYARD / "truth")
+    names = [truth.image(truth_id).name for truth_id in sorted(truth.reg_image_ids())[5:15:9]]
+    given = with_own_lenses(truth, dict.fromkeys(names, 1.1))
+    held = sfm_shapefit.locate(given, COURTYARD / "database.db", intrinsics="held")
+    assert len(held.told_evidence.lenses) == 2
+    (line,) = (warning for warning in held.warnings if "focal length" in warning)
+    freed = sfm_shapefit.locate(given, COURTYARD / "database.db")
+    (changed,) = (warning for warning in freed.warnings if "focal length" in warning)
+    assert all(name in line and name in changed for name in names)
+    assert changed.count("images contradicted what was given") == 1

@@ -59,7 +59,7 @@ def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path, by_pairs):
     found = by_pairs
     (model,) = found.models
     assert (found.num_placed, found.left_out, found.warnings) == (25, {}, ())
-    errors = sfm_shapefit.evaluate(model.located.reconstruction, COURTYARD / "truth")
+    errors = sfm_shapefit.evaluate(model.reconstruction, COURTYARD / "truth")
     assert errors.position.max < 0.005 * errors.extent  # measured 0.0007; a quarter of the pairs is false
     assert errors.rotation_deg.max < 0.2
     sfm_shapefit.write_result(found, tmp_path / "out")
@@ -68,7 +68,7 @@ def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path, by_pairs):
     facts = json.loads((tmp_path / "out" / "map.json").read_text())
     assert facts["num_placed"] == facts["models"][0]["num_placed"] == 25
     # The pairs whose baselines were made false are told by the matches that are missing in their overlap.
-    pairs = {name: np.array(column) for name, column in model.located.table("pairs").items()}
+    pairs = {name: np.array(column) for name, column in model.table("pairs").items()}
     false = pairs["residual_deg"] > 10.0
     assert false.sum() > 30
     assert np.nanmax(pairs["pair_score"][false]) < np.nanmedian(pairs["pair_score"][~false])
@@ -77,14 +77,14 @@ def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path, by_pairs):
 
 def test_used_pairs_of_tiny_scores_are_listed_and_can_be_left_out(tmp_path, by_pairs):
     found = by_pairs
-    located = found.models[0].located
+    located = found.models[0]
     scores, row = located.scores.copy(), next(r for r in located.pairs if r.verdict == "inlier")
     names = [(pair.name1, pair.name2) for pair in located.pairs]
     scores[names.index((row.name1, row.name2)), 1] = 1e-4
-    model = dataclasses.replace(found.models[0], located=dataclasses.replace(located, scores=scores))
+    model = dataclasses.replace(located, scores=scores)
     sfm_shapefit.write_result(dataclasses.replace(found, models=(model,)), tmp_path / "out")
     listed = tmp_path / "out" / "0" / "doubtful_pairs.csv"
-    assert read_pair_list(listed, model.names) == {(row.name1, row.name2)}
+    assert read_pair_list(listed, model.averaged_names) == {(row.name1, row.name2)}
 
 
 def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_path):
@@ -95,9 +95,9 @@ def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_pat
     found = sfm_shapefit.map_database(changed(RING, tmp_path, f"{PAIRS} {ACROSS}"), priors=table, **FAST)
     scales = {}
     for model in found.models:
-        scales[model.names[0] in truth.names[:4]] = model.located.gauge.scale
-        if model.located.gauge.scale == "prior":
-            images = model.located.reconstruction.images.values()
+        scales[model.averaged_names[0] in truth.names[:4]] = model.gauge.scale
+        if model.gauge.scale == "prior":
+            images = model.reconstruction.images.values()
             off = [image.projection_center() - positions[image.name] for image in images if image.has_pose]
             # Half a pixel, as far as the placement alone is off; the scene is 20 units across.
             assert len(off) == 4
@@ -113,11 +113,11 @@ def test_what_is_noteworthy_of_priors_is_told_once_for_all_components(tmp_path):
     path = changed(RING, tmp_path, f"{PAIRS} {ACROSS}")
     found = sfm_shapefit.map_database(path, priors=table, join="never", **FAST)
     assert len(found.models) == 2
-    told = [*found.warnings, *(warning for model in found.models for warning in model.located.warnings)]
+    told = [*found.warnings, *(warning for model in found.models for warning in model.warnings)]
     assert sum("taken for latitude and longitude in degrees" in warning for warning in told) == 1
     for model in found.models:
-        assert model.located.gauge.datum is not None
-        errors = sfm_shapefit.evaluate(model.located.reconstruction, RING / "sparse" / "0")
+        assert model.gauge.datum is not None
+        errors = sfm_shapefit.evaluate(model.reconstruction, RING / "sparse" / "0")
         assert errors.ref_from_model.scale == pytest.approx(0.1, rel=0.01)
 
 
@@ -132,7 +132,7 @@ def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_
     found = sfm_shapefit.map_database(path, priors=table, join="never", **FAST)
     assert "join" not in found.timings_s
     assert first.call_count == 2  # priors that are given up leave what came before them
-    scales = {model.names[0] in truth.names[:4]: model.located for model in found.models}
+    scales = {model.averaged_names[0] in truth.names[:4]: model for model in found.models}
     assert {is_first: one.gauge.scale for is_first, one in scales.items()} == {True: "unit", False: "prior"}
     assert found.joins == ()
     said = "the scale is not that of position priors: the position priors coincide"
@@ -165,9 +165,7 @@ def test_the_adjusted_first_placement_is_as_good_as_the_matches_allow(tmp_path):
 
     def errors(**options):
         found = sfm_shapefit.map_database(tmp_path / "made" / "database.db", min_trust=0.0, **options)
-        compared = sfm_shapefit.evaluate(
-            found.models[0].located.reconstruction, tmp_path / "made" / "sparse" / "0"
-        )
+        compared = sfm_shapefit.evaluate(found.models[0].reconstruction, tmp_path / "made" / "sparse" / "0")
         assert len(compared.names) == 10
         return compared.position.rms, compared.rotation_deg.rms
 
@@ -180,14 +178,14 @@ def test_the_adjusted_first_placement_is_as_good_as_the_matches_allow(tmp_path):
 def test_images_that_see_few_points_are_left_out_with_the_reason_unless_pixels_confirm_them(
     tmp_path, monkeypatch, ring_mapped
 ):
-    everyone = ring_mapped.models[0].located
+    everyone = ring_mapped.models[0]
     model = everyone.reconstruction
     counts = {image.name: image.num_points3D for image in model.images.values()}
     assert everyone.kept.all()
     assert everyone.few_points == {}
     poorest = min(counts, key=counts.get)
     limit = counts[poorest] + 1
-    found = sfm_shapefit.map_database(RING / "database.db", min_points_per_image=limit).models[0].located
+    found = sfm_shapefit.map_database(RING / "database.db", min_points_per_image=limit).models[0]
     assert found.few_points == {}
     assert {image.name: image.num_points3D for image in found.reconstruction.images.values()} == counts
     monkeypatch.setattr(evidence, "ask_pixels", lambda *given: np.zeros_like(given[-1]))
@@ -261,8 +259,8 @@ def test_pairs_that_are_to_be_left_out_take_no_part_anywhere_nor_in_an_executor(
     database = changed(RING, tmp_path / "edited", f"{PAIRS} {' OR '.join(gone)}")
     with ThreadPoolExecutor(2) as pool:
         left_out = {"without": str(without), "executor": pool}
-        given = sfm_shapefit.map_database(RING / "database.db", **left_out, **FAST).models[0].located
-    gone = sfm_shapefit.map_database(database, **FAST).models[0].located
+        given = sfm_shapefit.map_database(RING / "database.db", **left_out, **FAST).models[0]
+    gone = sfm_shapefit.map_database(database, **FAST).models[0]
     np.testing.assert_array_equal(given.directions.pairs, gone.directions.pairs)
     assert len(given.directions.pairs) > 0
     centers = [found.table("cameras")["x"] for found in (given, gone)]
@@ -336,18 +334,20 @@ def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowh
 
     monkeypatch.setattr("sfm_shapefit.pipeline.mapping.measure_rotations", with_a_false_loop)
     found = sfm_shapefit.map_database(database, sequence="names", **FAST)
-    (loop,) = found.models[0].located.loops
-    names = found.models[0].names
+    (loop,) = found.models[0].loops
+    names = found.models[0].averaged_names
     assert (loop.first, loop.second, loop.num_refused) == ((names[0],) * 2, (names[15],) * 2, 1)
-    assert [0, 15] not in found.models[0].located.directions.pairs.tolist()
+    assert [0, 15] not in found.models[0].directions.pairs.tolist()
     sfm_shapefit.write_result(found, tmp_path / "out")
     assert json.loads((tmp_path / "out" / "0" / "locate.json").read_text())["loops"][0]["num_refused"] == 1
-    assert "1 is not used because the frames between contradict it" in str(found.told.rows)
+    assert "1 is not used, as the images between contradict it (sequence=none uses all)" in str(
+        found.told.rows
+    )
     assert '"refused"]' in (tmp_path / "out/0/report.html").read_text()
-    assert describe_loops(found.models[0].located.facts.loops).endswith(f"{names[0]} to {names[15]}")
+    assert describe_loops(found.models[0].facts.loops).endswith(f"{names[0]} to {names[15]}")
     blind = sfm_shapefit.map_database(database, sequence="none", **FAST)
-    assert (blind.num_video_frames, blind.models[0].located.loops) == (0, ())
-    assert [0, 15] in blind.models[0].located.directions.pairs.tolist()
+    assert (blind.num_video_frames, blind.models[0].loops) == (0, ())
+    assert [0, 15] in blind.models[0].directions.pairs.tolist()
 
 
 def test_a_straight_drive_is_placed_by_points_and_says_how_sure_lengths_are(tmp_path, monkeypatch):
@@ -364,7 +364,7 @@ def test_a_straight_drive_is_placed_by_points_and_says_how_sure_lengths_are(tmp_
     monkeypatch.setattr(layouts, "street", street)
     monkeypatch.setitem(layouts.LAYOUTS, "drive", straight)
     write_workspace(make_scene(SceneOptions(shape="drive", num_images=8, seed=2)), tmp_path / "made")
-    located = sfm_shapefit.map_database(tmp_path / "made" / "database.db").models[0].located
+    located = sfm_shapefit.map_database(tmp_path / "made" / "database.db").models[0]
     errors = sfm_shapefit.evaluate(located.reconstruction, tmp_path / "made" / "sparse" / "0")
     assert errors.position.max < 0.01 * errors.extent
     assert 1e-5 < located.line_sigma < 0.01
@@ -379,17 +379,35 @@ def test_pairs_are_left_out_of_databases_only(tmp_path):
         sfm_shapefit.locate(RING / "sparse" / "0", directions="tracks", without=str(listed))
 
 
+@pytest.mark.parametrize("name", ["second/'||name", "clip_'||image_id||'.jpg'"])
+def test_a_folder_or_a_clip_none_of_whose_images_can_be_placed_is_one_line(tmp_path, name):
+    lost = " OR ".join(f"pair_id / {PAIR} = {k} OR pair_id % {PAIR} = {k}" for k in (6, 7, 8))
+    path = changed(RING, tmp_path, f"{PAIRS} {lost}")
+    edit_database(path, f"UPDATE images SET name = '{name} WHERE image_id >= 6")
+    place, first = ("second/", "second/0006.jpg") if "/" in name else ("clip_*.jpg", "clip_6.jpg")
+    said = run("map", path, tmp_path / "out", "--no-report", code=0).stdout
+    assert f"in no model: all 3 images of {place}, {first} for one: no matches: fewer than" in said
+    assert said.count("in no model:") == 1
+
+
+def told_under(found, label):
+    """Return the lines that a terminal has under a label."""
+    return [line for row in found.told.rows if row.label == label for line in row.lines]
+
+
 def test_components_become_models_of_their_own_and_single_images_are_named(tmp_path):
     lonely = f"pair_id / {PAIR} = 8 OR pair_id % {PAIR} = 8"
     path = changed(RING, tmp_path, f"{PAIRS} {ACROSS} OR {lonely}")
     found = sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(**FAST, min_trust=0.0))
-    assert [model.names for model in found.models] == [
+    assert [model.averaged_names for model in found.models] == [
         tuple(f"{k:04d}.jpg" for k in group) for group in ((1, 2, 3, 4), (5, 6, 7))
     ]
     assert list(found.left_out) == ["0008.jpg"]
     assert "no matches" in found.left_out["0008.jpg"]
-    assert any("is in no model" in warning for warning in found.warnings)
-    assert found.models[0].located.verdict.statement == "good"
+    assert any(line.startswith("0008.jpg: no matches") for line in told_under(found, "in no model"))
+    others = {row.name for row in found.cameras if not row.placed} - set(found.models[0].not_placed)
+    assert others <= {row.name for row in found.models[1].cameras if row.placed}
+    assert found.models[0].verdict.statement == "good"
     assert found.verdict.statement == "look: 43% of the images stand in another model"
     sfm_shapefit.write_result(found, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
@@ -406,7 +424,7 @@ def test_a_guessed_focal_length_is_found_and_told(tmp_path):
     before = path.read_bytes()
     found = sfm_shapefit.map_database(path, **FAST)
     assert path.read_bytes() == before
-    located = found.models[0].located
+    located = found.models[0]
     (row,) = located.summary()["intrinsics"]
     told = row["origin"], row["decided_by"], row["given_focal_px"], row["num_images"]
     assert told == ("a guess", "adjusted", 850.0, 8)
@@ -416,16 +434,18 @@ def test_a_guessed_focal_length_is_found_and_told(tmp_path):
     errors = sfm_shapefit.evaluate(located.reconstruction, RING / "sparse" / "0")
     assert errors.position.max < 1e-3 * errors.extent
     (line,) = describe_intrinsics(located.facts.intrinsics)
-    assert line.startswith("camera 1: focal length 850.0 px (a guess) became 1,000.")
+    assert line.startswith("camera 1 (0001.jpg and 7 more): focal length 850.0 px (a guess) became 1,000.")
     assert "(+17.6%) by adjustment" in line
 
 
 def test_a_focal_length_that_is_not_to_be_refined_stays_and_is_named(tmp_path):
     path = changed(RING, tmp_path, wrong_focal_length(1.01))
     found = sfm_shapefit.map_database(path, intrinsics="held", **FAST)
-    located = found.models[0].located
+    located = found.models[0]
     assert located.reconstruction.camera(1).params.tolist() == [1010.0, 1010.0, 600.0, 450.0]
-    assert any("camera 1 kept a focal length that was never" in warning for warning in located.warnings)
+    assert any(
+        "0001.jpg and 7 more) kept a focal length that was never" in warning for warning in located.warnings
+    )
     assert located.summary()["intrinsics"][0]["decided_by"] == "held"
 
 
@@ -435,7 +455,7 @@ def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tm
     taped = ("0001.jpg", "0008.jpg", 3.0)  # from one model to the other
     found = sfm_shapefit.map_database(database, sfm_shapefit.MapOptions(**FAST), known_distance=(taped,))
     (told,) = found.joins
-    assert [len(model.names) for model in found.models] == [4, 4]
+    assert [len(model.averaged_names) for model in found.models] == [4, 4]
     assert [warning for warning in found.warnings if "0001.jpg and 0008.jpg is of no use" in warning] == (
         [f"the known distance of 0001.jpg and 0008.jpg is of no use: {APART}"] if wrong else []
     )
@@ -455,7 +475,7 @@ def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tm
     assert len(errors.names) == 8
     assert errors.position.max < 1e-5 * errors.extent  # the keypoints are exact
     assert errors.rotation_deg.max < 1e-3
-    models = [model.located.reconstruction for model in found.models]
+    models = [model.reconstruction for model in found.models]
     assert whole.reconstruction.num_points3D() == sum(model.num_points3D() for model in models)
     same = [(min(models[0].point3D_ids()), min(models[1].point3D_ids()))]
     merged, renamed, new = merge_models(*models, told.join.to_from_piece, same)
@@ -470,12 +490,12 @@ KEEP_ONE = f"{PAIRS} {ACROSS} AND pair_id != {1 * PAIR + 8}"
 
 def test_a_second_rigid_piece_is_a_model_and_what_keeps_it_apart_is_told(tmp_path):
     found = sfm_shapefit.map_database(changed(RING, tmp_path, KEEP_ONE), **FAST)
-    assert [int(model.located.kept.sum()) for model in found.models] == [4, 4]
-    placed = {row.name for model in found.models for row in model.located.cameras if row.placed}
+    assert [int(model.kept.sum()) for model in found.models] == [4, 4]
+    placed = {row.name for model in found.models for row in model.cameras if row.placed}
     assert len(placed) == found.num_placed == 8
     assert not found.left_out
     # The images of the other are not missing in either, but not there: neither is all of the scene.
-    verdicts = [model.located.verdict for model in found.models]
+    verdicts = [model.verdict for model in found.models]
     assert [verdict.grade for verdict in verdicts] == ["look", "look"]
     assert all("of the images stand in another model" in verdict.reasons[-1] for verdict in verdicts)
     (told,) = found.joins
@@ -501,7 +521,7 @@ def check_joined_folder(folder, found):
     assert facts.known_distances[0].found == pytest.approx(3.0)
     assert "0001.jpg and 0008.jpg are 3 apart" in facts.scale
     assert facts.joins[0].statement == found.joins[0].statement
-    rows = [row for model in found.models for row in model.located.cameras]
+    rows = [row for model in found.models for row in model.cameras]
     assert dict(zip(drawing.cameras.names, drawing.cameras.trust.tolist(), strict=True)) == {
         row.name: row.trust for row in rows
     }
@@ -509,7 +529,7 @@ def check_joined_folder(folder, found):
     together = {row.name: row for row in found.joined[0].cameras}
     scales, own = [], []
     for model in found.models:
-        (first, *_, last) = ours = model.located.cameras
+        (first, *_, last) = ours = model.cameras
         apart = [
             np.subtract(two.center, one.center)
             for one, two in ((first, last), (together[first.name], together[last.name]))
@@ -522,7 +542,7 @@ def check_joined_folder(folder, found):
             assert np.sum(np.square(together[name].sigma)) == pytest.approx(
                 variance + more, rel=1e-4, abs=0.0
             )
-    assert len(drawing.pairs.classes) > sum(len(model.located.pairs) for model in found.models)
+    assert len(drawing.pairs.classes) > sum(len(model.pairs) for model in found.models)
     assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
     assert (folder / "report.html").is_file()
     assert banner(drawing, facts)["command"].startswith("sfm-shapefit workspace ")  # its models are adjusted
@@ -568,4 +588,4 @@ def test_keypoints_that_are_all_at_one_place_cost_their_image_alone(tmp_path, im
         return
     mapped = sfm_shapefit.map_database(path)
     assert mapped.num_placed == 7
-    assert [row.name for row in mapped.models[0].located.cameras if not row.placed] == [f"{image:04}.jpg"]
+    assert [row.name for row in mapped.models[0].cameras if not row.placed] == [f"{image:04}.jpg"]

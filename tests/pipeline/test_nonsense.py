@@ -75,10 +75,10 @@ def called_good(path, is_false=bool):
         return []
     told = []
     for model in found.models:
-        reconstruction = model.located.reconstruction
+        reconstruction = model.reconstruction
         if not is_false([int(reconstruction.image(k).name[:2]) for k in reconstruction.reg_image_ids()]):
             continue
-        told.append(("map", model.located.verdict))
+        told.append(("map", model.verdict))
         told.append(("check", check(reconstruction, path, second_opinion=found).verdict))
         told.append(("locate", locate(reconstruction, path).verdict))
     return [who for who, verdict in told if verdict.grade is Grade.GOOD]
@@ -98,7 +98,7 @@ def test_a_camera_that_a_single_pair_holds_is_to_be_looked_at_and_no_more(tmp_pa
     once = {pair: own for pair, own in matches.items() if 5 not in pair or pair == (4, 5)}
     for name, pairs in (("all.db", matches), ("once.db", once)):
         write(tmp_path / name, keypoints, pairs)
-    model = map_database(tmp_path / "all.db").models[0].located.reconstruction
+    model = map_database(tmp_path / "all.db").models[0].reconstruction
     assert check(model, tmp_path / "all.db", second_opinion=False).verdict.grade is Grade.GOOD
     thin = check(model, tmp_path / "once.db", second_opinion=False)
     assert thin.verdict.grade in (Grade.GOOD, Grade.LOOK)  # points of three images may check it
@@ -120,7 +120,7 @@ def test_near_duplicates_that_stand_apart_are_named_and_a_camera_that_stands_sti
     matches |= {(i, 6): own for (i, j), own in matches.items() if j == 5}
     matches[5, 6] = np.tile(np.arange(len(keypoints[5]))[:, None], (1, 2))
     write(tmp_path / "database.db", keypoints, matches)
-    model = map_database(tmp_path / "database.db").models[0].located.reconstruction
+    model = map_database(tmp_path / "database.db").models[0].reconstruction
     still = check(model, tmp_path / "database.db", second_opinion=False)
     assert not still.facts.evidence.odd
     (moved,) = (image for image in model.images.values() if image.name == "06.jpg")

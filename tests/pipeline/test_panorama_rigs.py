@@ -153,7 +153,7 @@ def six(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def mapped(six):
-    return sfm_shapefit.map_database(six[0] / "database.db").models[0].located
+    return sfm_shapefit.map_database(six[0] / "database.db").models[0]
 
 
 def test_map_places_faces_that_share_a_center_as_frames_in_an_open_scale(six, mapped):
@@ -180,7 +180,7 @@ def test_scenes_of_missing_faces_single_images_and_a_rig_with_a_baseline(tmp_pat
     ):
         folder.mkdir()
         truth = write_scene(folder, rigs, [*shots, *more, *[Shots(0, (0, 1, 2, 3))] * 2], seed=3)
-        found = sfm_shapefit.map_database(folder / "database.db").models[0].located
+        found = sfm_shapefit.map_database(folder / "database.db").models[0]
         assert found.gauge.scale == ("rig" if metric else "unit")
         assert_right(found.reconstruction, truth, most=0.01, metric=metric)
 
@@ -188,7 +188,7 @@ def test_scenes_of_missing_faces_single_images_and_a_rig_with_a_baseline(tmp_pat
 @pytest.mark.parametrize("offset", [1e-12, 1e-5])
 def test_offsets_too_short_to_tell_the_scale_leave_it_open_and_that_is_said(tmp_path, offset):
     truth = write_scene(tmp_path, [cube(5, offset)], [Shots(0, tuple(range(5)))] * 6, seed=2)
-    mapped = sfm_shapefit.map_database(tmp_path / "database.db").models[0].located
+    mapped = sfm_shapefit.map_database(tmp_path / "database.db").models[0]
     located = sfm_shapefit.locate(tmp_path / "truth", tmp_path / "database.db")
     for found, scale in ((mapped, "unit"), (located, "input")):
         assert_right(found.reconstruction, truth, metric=scale == "input")
@@ -198,7 +198,7 @@ def test_offsets_too_short_to_tell_the_scale_leave_it_open_and_that_is_said(tmp_
 
 
 def test_sensors_that_share_a_center_turn_but_stay_there_if_rigs_are_free(six):
-    found = sfm_shapefit.map_database(six[0] / "database.db", rigs="free").models[0].located
+    found = sfm_shapefit.map_database(six[0] / "database.db", rigs="free").models[0]
     assert_right(found.reconstruction, six[1])
     assert_at_one_center(found.reconstruction)
     turned = [pose.rotation.angle() for pose in found.reconstruction.rig(1).non_ref_sensors.values()]
@@ -220,7 +220,7 @@ def test_a_fixed_panorama_stays_and_priors_place_the_rest(six, tmp_path):
     table = tmp_path / "priors.txt"
     where = {image.name: 3.0 * image.projection_center() + 100.0 for image in truth.images.values()}
     table.write_text("".join(f"{name} {x} {y} {z}\n" for name, (x, y, z) in where.items()))
-    found = sfm_shapefit.map_database(folder / "database.db", priors=table).models[0].located
+    found = sfm_shapefit.map_database(folder / "database.db", priors=table).models[0]
     own = {
         found.reconstruction.image(i).name: found.reconstruction.image(i).projection_center()
         for i in found.reconstruction.reg_image_ids()

@@ -50,7 +50,7 @@ def test_marks_of_control_points_count_behind_a_panorama_too(tmp_path):
             lines.append(" ".join(map(str, (*point.xyz, x, y, image.name, f"p{point.xyz[0]:g}"))))
     (tmp_path / "marks.txt").write_text("\n".join(lines), encoding="utf-8")
     found = sfm_shapefit.map_database(tmp_path / "database.db", control_points=str(tmp_path / "marks.txt"))
-    points = found.models[0].located.facts.control_points
+    points = found.models[0].facts.control_points
     assert [(point.num_agreeing_marks, point.num_marks) for point in points] == 5 * [(6, 6)]
     for image in found.reconstruction.images.values():
         off = image.projection_center() - truth.find_image_with_name(image.name).projection_center()
@@ -59,5 +59,5 @@ def test_marks_of_control_points_count_behind_a_panorama_too(tmp_path):
 
 def test_nothing_is_said_of_a_focal_length_of_panoramas(tmp_path):
     write_scene(tmp_path, [camera_of_model("EQUIRECTANGULAR"), camera_of_model("PINHOLE", 2)], num_frames=8)
-    found = sfm_shapefit.map_database(tmp_path / "database.db", intrinsics="all").models[0].located
+    found = sfm_shapefit.map_database(tmp_path / "database.db", intrinsics="all").models[0]
     assert [row.camera for row in found.facts.intrinsics] == [2]

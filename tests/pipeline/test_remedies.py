@@ -30,7 +30,9 @@ def test_a_lens_that_is_wrong_is_freed_and_the_cameras_stand_right(truth):
     name = truth.image(5).name
     found = sfm_shapefit.locate(with_own_lenses(truth, {name: 1.1}), DATABASE)
     assert found.verdict.grade is Grade.GOOD
-    assert any(f"camera {truth.image(5).image_id}: focal length" in warning for warning in found.warnings)
+    assert any(
+        f"camera {truth.image(5).image_id} ({name}): focal length" in warning for warning in found.warnings
+    )
     lens = found.reconstruction.find_image_with_name(name).camera
     assert lens.mean_focal_length() == pytest.approx(truth.image(5).camera.mean_focal_length(), rel=1e-3)
     assert sfm_shapefit.evaluate(found.reconstruction, truth).position.max < 1e-3
@@ -48,8 +50,8 @@ def test_map_frees_a_lens_too(truth, tmp_path):
         database.execute("UPDATE frame_data SET sensor_id = 2 WHERE frame_id = 5")
         database.execute("UPDATE images SET camera_id = 2 WHERE image_id = 5")
     (model,) = sfm_shapefit.map_database(path).models
-    assert model.located.reconstruction.camera(2).mean_focal_length() == pytest.approx(1000.0, rel=0.001)
-    assert model.located.verdict.grade is Grade.GOOD
+    assert model.reconstruction.camera(2).mean_focal_length() == pytest.approx(1000.0, rel=0.001)
+    assert model.verdict.grade is Grade.GOOD
 
 
 def test_a_lens_whose_image_is_left_out_is_found_too():

@@ -71,7 +71,7 @@ def test_other_names_change_nothing_of_a_map_but_its_world(renamed):
     plain, other = (
         sfm_shapefit.map_database(path, adjust="none", sequence="none") for path in (DATABASE, database)
     )
-    first, second = (centers_of(found.models[0].located.reconstruction) for found in (plain, other))
+    first, second = (centers_of(found.models[0].reconstruction) for found in (plain, other))
     assert len(first) == len(second) == len(names)
     fit = fit_similarity(second, first)
     np.testing.assert_allclose(fit.apply(second), first, atol=1e-4 * np.ptp(first))

@@ -367,13 +367,13 @@ def mapped(workspace):
 def test_map_averages_over_frames_and_has_the_scale_of_the_rigs(mapped, workspace):
     (model,) = mapped.models
     assert (mapped.num_placed, mapped.left_out, mapped.warnings) == (36, {}, ())
-    assert model.located.gauge.scale == "rig"
-    errors = sfm_shapefit.evaluate(model.located.reconstruction, workspace / "truth")
+    assert model.gauge.scale == "rig"
+    errors = sfm_shapefit.evaluate(model.reconstruction, workspace / "truth")
     assert abs(errors.ref_from_model.scale - 1.0) < 1e-3
     # Half a pixel of noise; `locate` with the true rotations ends at 0.001 of an extent of 10.
     assert errors.position.max < 0.01
     truth = pycolmap.Reconstruction(workspace / "truth")
-    assert_rigs_equal(model.located.reconstruction, truth, atol=1e-12)
+    assert_rigs_equal(model.reconstruction, truth, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -405,7 +405,7 @@ def test_disturbed_rigs_are_refined_to_the_truth_and_the_mean_baseline_stays(dis
     if way == "locate":
         found = sfm_shapefit.locate(model, database, rigs="free")
     else:
-        found = sfm_shapefit.map_database(database, rigs="free").models[0].located
+        found = sfm_shapefit.map_database(database, rigs="free").models[0]
     said = np.array([pose.translation for pose in model.rig(1).non_ref_sensors.values()])
     (rig,) = found.reconstruction.rigs.values()
     poses = {sensor.id: pose for sensor, pose in rig.non_ref_sensors.items()}
@@ -443,7 +443,7 @@ def test_a_component_without_rigs_has_a_scale_of_its_own_beside_one_with_rigs(wo
         *(f"DELETE FROM {table} WHERE rig_id = 2" for table in ("frames", "rig_sensors", "rigs")),
     )
     found = sfm_shapefit.map_database(database, points="never")
-    scales = [model.located.gauge.scale for model in found.models]
+    scales = [model.gauge.scale for model in found.models]
     assert sorted(scales) == ["rig", "unit"]
 
 
@@ -469,11 +469,11 @@ def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_t
     write_workspace(scene, tmp_path / "yard")
     database = edit_database(tmp_path / "yard" / "database.db", keep_few_matches(16, 8))
     found = sfm_shapefit.map_database(database)
-    assert [len(model.names) for model in found.models] == [16, 16]
+    assert [len(model.averaged_names) for model in found.models] == [16, 16]
     (told,) = found.joins
     assert told.join is not None, told.statement
     assert told.join.to_from_piece.scale == 1.0
-    sigmas = [model.located.gauge.scale_sigma for model in found.models]
+    sigmas = [model.gauge.scale_sigma for model in found.models]
     assert told.join.scale_sigma == pytest.approx(np.hypot(*sigmas))
     (joined,) = found.joined
     whole = read_model(joined.reconstruction)

@@ -51,7 +51,7 @@ def found(spoiled, tried):
 
 
 def test_rough_rotations_lead_to_the_model_of_map(found, courtyard_mapped):
-    mapped = courtyard_mapped.models[0].located
+    mapped = courtyard_mapped.models[0]
     errors = [sfm_shapefit.evaluate(one, TRUTH).position.mean for one in (found, mapped)]
     assert found.reconstruction.num_reg_images() == mapped.reconstruction.num_reg_images()
     assert errors[0] <= 1.05 * errors[1]
@@ -82,7 +82,7 @@ def guessed(tmp_path_factory):
     shutil.copyfile(PHOTOGRAPHED / "database.db", database)
     guess = np.array([1.05 * 480.0, 320.0, 240.0, 0.0, 0.0], dtype="<f8").tobytes().hex()
     edit_database(database, f"UPDATE cameras SET params = x'{guess}', prior_focal_length = 0")
-    return database, sfm_shapefit.map_database(database).models[0].located
+    return database, sfm_shapefit.map_database(database).models[0]
 
 
 def test_lists_with_focal_lengths_off_and_no_distortion_lead_to_the_model_of_map(

@@ -18,7 +18,7 @@ def test_a_lens_without_distortion_that_is_guessed_is_found_before_the_rig_is_as
     assert found.reconstruction.num_reg_images() == 48
     focal_px = [camera.mean_focal_length() for camera in found.reconstruction.cameras.values()]
     np.testing.assert_allclose(focal_px, 129.2, rtol=0.02)  # as the maker of the rig has it
-    assert any("taken to share one center" in warning for warning in found.models[0].located.warnings)
+    assert any("taken to share one center" in warning for warning in found.models[0].warnings)
 
 
 def test_without_a_database_check_and_locate_call_a_tiny_rig_good_and_pixels_that_fit_hold_no_second_place():

@@ -144,7 +144,7 @@ def test_the_command_says_what_is_ready_or_what_failed(monkeypatch):
     monkeypatch.setattr(module, "warm_up", lambda _names, tell: (tell and tell(7, 7)) or outcome[0])
     done = run("warm-up", code=0)
     assert "7 ready on disk" in done.stdout
-    assert done.stderr == "sfm-shapefit: compiling 7 of 7\n"
+    assert done.stderr == ""  # which says how far it is after ten seconds
     assert run("warm-up", "-q", code=0).output == ""
     outcome[0] = WarmUp(0, ())
     assert "since before" in run("warm-up", code=0).stdout
@@ -154,7 +154,7 @@ def test_the_command_says_what_is_ready_or_what_failed(monkeypatch):
 
 COLD = """
 import numpy as np
-from sfm_shapefit.cli.console import show_progress
+from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.pipeline import warm_up
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 warm_up.NEEDED = ("find_pieces",)
@@ -170,5 +170,5 @@ def test_a_cold_command_lets_other_processes_compile_and_says_how_far_they_are(t
     cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     done = run_python("-c", COLD, **cache)
     assert done.returncode == 0, done.stderr[-500:]
-    assert re.search(r"compiling (\d+) of \1$", done.stderr, flags=re.MULTILINE)
+    assert re.search(r"compiling kernels, once: \d+ of \d+$", done.stderr, flags=re.MULTILINE)
     assert list((tmp_path / "cache").rglob("find_pieces-*"))

@@ -101,7 +101,7 @@ def test_a_model_that_is_not_known_is_held_and_nothing_else_is_said(tmp_path, mo
     path, _ = make_database(tmp_path, "EUCM", guess_px=1.05 * FOCAL_PX)
     (one,) = sfm_shapefit.map_database(path, intrinsics="focal").models
     assert one.reconstruction.cameras[1].focal_length_x == 1.05 * FOCAL_PX
-    told = " ".join(one.located.warnings)
+    told = " ".join(one.warnings)
     assert "not adjusted here, but by COLMAP's bundle_adjuster" in told
     assert "intrinsics=focal" not in told
     assert "sfm-shapefit map" not in told

@@ -207,6 +207,6 @@ def test_what_cannot_be_converted_is_refused_in_a_sentence(tmp_path, placed):
 
 def test_a_result_in_memory_knows_its_datum(tmp_path, placed):
     found = sfm_shapefit.locate(FOLDER, DATABASE, priors=str(placed[0].parent / "priors.csv"))
-    assert sfm_shapefit.convert(found, tmp_path / "poses.csv", crs="utm") == "csv"
+    assert sfm_shapefit.convert(found, tmp_path / "poses.csv", crs="utm") == tmp_path / "poses.csv"
     converted(placed, tmp_path / "other.csv", "--crs", "utm")
     assert (tmp_path / "poses.csv").read_text() == (tmp_path / "other.csv").read_text()

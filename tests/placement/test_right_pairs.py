@@ -28,7 +28,7 @@ def test_right_pairs_that_are_rigid_have_one_certified_optimum_which_is_the_trut
     assert told.solve.unique
     assert "has one optimum, certified to" in told.statement
     assert told.statement in str(found.told)
-    posterior = np.array([row.posterior for row in found.pairs])
+    posterior = np.array([row.scores.posterior for row in found.pairs])
     np.testing.assert_array_equal(posterior > 0.5, ~problem.corrupted)
 
 

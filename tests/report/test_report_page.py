@@ -152,6 +152,7 @@ def test_the_words_say_what_is_placed_and_what_to_look_at():
 def test_a_lens_in_doubt_is_a_row_of_the_table_and_no_sentence():
     drawing, facts = make_drawing()
     lens = CameraIntrinsics(
+        image="0001.jpg",
         camera=3,
         num_images=7,
         model="SIMPLE_RADIAL",

@@ -31,7 +31,7 @@ def test_what_is_drawn_of_a_result_is_what_its_facts_count():
 
 def test_map_is_not_compared_with_positions_that_no_database_has():
     """Sensors of rigs stand apart in a database, by their offsets."""
-    found = map_database(RING / "database.db", points="never").models[0].located
+    found = map_database(RING / "database.db", points="never").models[0]
     given = np.random.default_rng(1).standard_normal(found.images.frames.centers.shape)
     apart = replace(found.images, frames=replace(found.images.frames, centers=given))
     drawing = draw_result(replace(found, images=apart))

@@ -105,7 +105,7 @@ def up_in(model):
 
 def test_map_delivers_an_upright_model_and_names_a_wrong_gravity():
     found = sfm_shapefit.map_database(RING / "database.db", gravity=str(BUNDLED / "gravity.txt"))
-    located = found.models[0].located
+    located = found.models[0]
     # The mean of seven gravities, each 1 deg off per axis, is off by 1.18 / sqrt(7) deg in the median.
     assert angle_between_deg(up_in(located.reconstruction), np.array([0.0, 0.0, 1.0])) < 3 * 1.18 / np.sqrt(7)
     assert located.gauge.statement.endswith("; z up by 7 of 8 gravities")

@@ -105,7 +105,7 @@ const drawControl = () => {
 };
 const drawLoops = () => {
   $("loops-card").hidden = !data.loops.length;
-  fill("loops", plainTable(["From", "To", "Pairs", "Matches", "Off the frames between (°)", "What became of it"], data.loops));
+  fill("loops", plainTable(["From", "To", "Pairs", "Matches", "Off the images between (°)", "What became of it"], data.loops));
   $("loops-note").textContent = data.notes.loops;
 };
 
