@@ -120,8 +120,8 @@ def test_a_dual_a_little_off_proves_nearly_the_optimum_in_any_dimension(d):
     off = 1e-3 * np.random.default_rng(d).standard_normal(y.shape)
     found = certify(graph, t, y + off)
     assert_feasible(graph, found)
-    # What leaves the balls lowers the bound; by the metric of ones it does so by about the size of the change.
-    assert 0.0 < found.gap < 0.05 * (found.objective - unit_bound(graph, t, y + off))
+    # What leaves the balls lowers the bound, by the metric of ones about as much as it is changed.
+    assert 0.0 < found.gap < 0.1 * (found.objective - unit_bound(graph, t, y + off))
 
 
 def test_no_spoilt_dual_proves_more_than_the_optimum_and_wrong_locations_still_prove_a_bound():
