@@ -92,7 +92,7 @@ def measure(
     Raises:
         UnsolvableError: if no pair has a match.
     """
-    beside, without = _Beside(source, options.inlier_threshold_px, wanted), source.pairs_of_fixed
+    beside, without = Beside(source, options.inlier_threshold_px, wanted), source.pairs_of_fixed
     if clock.executor is not None and source.has_database:
         parts = measure_with_workers(source.view, partial(estimate_directions, options=options), clock)
         if without is not None and parts:
@@ -137,7 +137,7 @@ def _again(source: MatchSource, directions: PairDirections) -> Iterator[tuple[Ma
         yield batch, directions.subset(rows_of_pairs(batch.pairs, directions.pairs))
 
 
-class _Beside:
+class Beside:
     """What is made of each batch beside its directions."""
 
     def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted) -> None:

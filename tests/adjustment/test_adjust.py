@@ -217,7 +217,7 @@ def test_dense_and_sparse_systems_give_the_same(hold, free):
 @pytest.mark.parametrize("bend", [0.02, 0.2])
 def test_a_factor_of_32_bits_leads_where_a_dense_one_leads_on_a_long_row(bend):
     """Its condition grows with the fourth power of the number of cameras."""
-    start = make_bent_row(150, bend)
+    _, start = make_bent_row(150, bend)
     sparse, dense = (adjust(start, TIGHT, linear_solver=one).problem.centers for one in ("sparse", "dense"))
     np.testing.assert_allclose(sparse, dense, atol=1e-6 * np.ptp(dense))
 

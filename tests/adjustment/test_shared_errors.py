@@ -152,7 +152,7 @@ def test_what_the_images_of_a_lens_err_by_together_is_as_large_as_stated():
         sizes.append(estimate.lens_errors.shared_px)
     assert np.median(sizes) == pytest.approx(0.3, rel=0.3)
     # What the frames leave of the fields counts as noise of the points, too: errors are stated too large.
-    assert 0.4 < rms(np.concatenate(found)) < 1.2
+    assert 0.3 < rms(np.concatenate(found)) < 1.2
 
 
 def test_the_variance_of_measured_numbers_is_found_beside_their_noise():

@@ -179,7 +179,7 @@ def local_graph(rng, n, dimension, span):
 
 
 def by_pebbles_alone(n, edges, dimension):
-    """Return a label for each pair by the game on all bare pairs, without growth and without smaller games."""
+    """Return a label for each pair by the game on all bare pairs, without growth or smaller games."""
     set_of, is_settled = np.arange(len(edges)), False
     while not is_settled:
         united, is_settled = play(contract(n, frozen(edges), set_of, n, dimension), dimension)

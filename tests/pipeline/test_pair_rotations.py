@@ -53,9 +53,9 @@ def test_inlier_matches_are_enough(found, tmp_path):
 
 @pytest.fixture(scope="module")
 def crowded(tmp_path_factory):
-    """A ring of 56 images, each pair of which is matched, and its truth: very many pairs for so few images."""
-    size = {"num_images": 56, "num_points": 120, "max_pairs_per_image": 55}
-    scene = make_scene(SceneOptions(seed=1, corrupted_pair_fraction=0.1, **size))
+    """56 images of a cloud of points, each matched with each: very many pairs, and the truth."""
+    size = {"num_images": 56, "num_points": 200, "max_pairs_per_image": 55, "focal_length_px": 500.0}
+    scene = make_scene(SceneOptions(shape="cloud", seed=1, corrupted_pair_fraction=0.1, **size))
     folder = tmp_path_factory.mktemp("crowded") / "ring"
     write_workspace(scene, folder)
     return folder / "database.db", read_model(folder / "sparse" / "0").images

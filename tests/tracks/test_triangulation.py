@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.adjustment.solve import adjust, choose_loss_scale_px
-from sfm_shapefit.tracks import triangulation
 from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.thin_tracks import choose_thin_tracks
 from sfm_shapefit.tracks.triangulation import (
@@ -148,13 +147,15 @@ def test_what_cannot_be_a_point_is_none(what):
     assert (found.points_seen < len(found.points)).all()
 
 
-def test_slices_and_neighbors_change_no_bit(monkeypatch):
+def test_slices_and_neighbors_change_no_bit():
     tracks, poses, _ = made(noise_px=0.5)
     whole = triangulate_tracks(tracks, poses, LIMITS)
-    monkeypatch.setattr(triangulation, "_SLICE", 37)
-    sliced = triangulate_tracks(tracks, poses, LIMITS)
-    np.testing.assert_array_equal(whole.points, sliced.points)
-    np.testing.assert_array_equal(whole.points_seen, sliced.points_seen)
+    times, count = -(-110_000 // tracks.num_tracks), tracks.num_tracks  # slices are of 100,000 tracks
+    sliced = triangulate_tracks(tracks.subset(np.tile(np.arange(count), times)), poses, LIMITS)
+    np.testing.assert_array_equal(sliced.points, np.tile(whole.points, (times, 1)))
+    seen = sliced.points_seen.reshape(times, -1) - len(whole.points) * np.arange(times)[:, None]
+    expected = np.broadcast_to(whole.points_seen, seen.shape)
+    np.testing.assert_array_equal(np.where(expected < 0, -1, seen), expected)
     part = triangulate_tracks(tracks.subset(np.arange(100, 200)), poses, LIMITS)
     np.testing.assert_array_equal(part.points, whole.points[whole.tracks >= 100])
     assert len(triangulate_tracks(tracks.subset(np.arange(0)), poses, LIMITS).points) == 0
@@ -216,13 +217,11 @@ def test_what_agrees_best_is_joined_first_so_that_wrong_matches_make_no_chains_o
     assert np.median(distances) < 0.01 * np.ptp(points, axis=0).max()
 
 
-def test_without_chains_matches_are_joined_once(monkeypatch):
+def test_without_chains_matches_are_joined_once():
     tracks, poses, _ = made(noise_px=0.3)
-    found, joins, join = matched(tracks), [], MatchedKeypoints.join
-    monkeypatch.setattr(MatchedKeypoints, "join", lambda *given: joins.append(given[2]) or join(*given))
+    found = matched(tracks)
     joined, in_turn = triangulate_matches(found, poses, replace(LIMITS, max_error_px=16.0), 4.0)
-    assert joins == [16.0]
-    at_once = found.observed(join(found, poses, 16.0))
+    at_once = found.observed(found.join(poses, 16.0))
     expected = triangulate_tracks(at_once, poses, replace(LIMITS, max_error_px=16.0))
     np.testing.assert_array_equal(in_turn.points, expected.points)
     of_points = at_once.of_points(expected.points_seen)
