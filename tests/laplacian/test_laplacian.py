@@ -103,7 +103,7 @@ def true_counts(n: int, edges: npt.NDArray[np.int64], order: npt.NDArray[np.int6
     return counts
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 40), density=st.floats(0.0, 0.4))
 def test_predicted_fill_is_that_of_the_elimination_game(seed, n, density):
     rng = np.random.default_rng(seed)
@@ -118,7 +118,7 @@ def test_predicted_fill_is_that_of_the_elimination_game(seed, n, density):
     assert tree.flops == sum(c * c for c in counts)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(2, 60),

@@ -61,16 +61,20 @@ def test_a_wrong_lens_that_is_held_is_named_with_the_right_focal_length():
     assert found.summary()["evidence"]["lenses"][0]["camera"] == wrong_id
 
 
-def test_of_a_lens_that_took_many_images_only_some_are_asked():
-    n = 450
-    lens = Lens("SIMPLE_PINHOLE", (100.0, 0.0, 0.0))
-    images = SimpleNamespace(lenses=(lens,), lens_of=np.zeros(n, dtype=int), is_posed=np.ones(n, dtype=bool))
-    assert np.flatnonzero(images_to_ask(images, None)).tolist() == list(range(0, n, 3))  # 200 at most
-    own = np.arange(n) % 2 == 0
-    assert np.flatnonzero(images_to_ask(images, own)).tolist() == list(range(0, n, 4))
-    few = SimpleNamespace(**vars(images) | {"is_posed": own & (np.arange(n) < 400)})
-    assert images_to_ask(few, None) is None
-    assert images_to_ask(few, own) is own
+@pytest.mark.parametrize(
+    ("num_posed", "asked", "expected"),
+    [
+        (450, None, range(0, 450, 3)),  # at most 200
+        (450, range(0, 450, 2), range(0, 450, 4)),
+        (150, None, None),
+        (150, range(0, 150, 2), range(0, 150, 2)),
+    ],
+)
+def test_of_a_lens_that_took_many_images_only_some_are_asked(num_posed, asked, expected):
+    lens, every = Lens("SIMPLE_PINHOLE", (100.0, 0.0, 0.0)), np.arange(450)
+    images = SimpleNamespace(lenses=(lens,), lens_of=np.zeros(450, dtype=int), is_posed=every < num_posed)
+    found = images_to_ask(images, asked if asked is None else np.isin(every, asked))
+    assert (found if found is None else np.flatnonzero(found).tolist()) == (expected and [*expected])
 
 
 def spoiled(amount_deg=0.0, shift=0.0):
@@ -177,7 +181,7 @@ class Row:
         self.pictures = SimpleNamespace(
             count=lambda _: n,
             pixels=lambda k, keypoints: pixels[k][keypoints],
-            project=lambda _k, x, ahead: 100.0 * x[:, :2] / x[:, 2:],
+            project=lambda _k, x, **_: 100.0 * x[:, :2] / x[:, 2:],
         )
         self.num_keypoints, self.is_same = np.full(4, n), np.arange(len(seen)) < same
         own = np.tile(np.arange(n)[:, None], 2)

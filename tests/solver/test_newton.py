@@ -38,7 +38,7 @@ def solved(graph, solver=solve_newton_dense, tol=TOL):
     return t, y
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),
     d=st.sampled_from([2, 3]),

@@ -52,7 +52,7 @@ def test_objective_and_lengths_are_those_of_the_formulas():
     assert objective(graph, np.zeros_like(t)) == np.inf
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),
     d=st.sampled_from([2, 3]),
