@@ -247,10 +247,8 @@ def wrong_in_part(share):
 def test_points_of_matches_are_the_same_bits_whatever_the_blocks(monkeypatch):
     original, _ = ring_model(noise_px=0.3)
     found = []
-    for tracks, matches in ((10**9, 10**9), (7, 11), (120, 500)):
-        monkeypatch.setattr("sfm_shapefit.adjustment.structure._TRACKS_A_BLOCK", tracks)
+    for matches in (10**9, 11, 500):
         monkeypatch.setattr("sfm_shapefit.adjustment.sources._MATCHES_A_SLICE", matches)
-        monkeypatch.setattr("sfm_shapefit.tracks.links._MATCHES_A_SLICE", matches)
         found.append(dump(triangulated(*seeded(original, batches=wrong_in_part(0.3)))))
     assert found[0] == found[1] == found[2]
 

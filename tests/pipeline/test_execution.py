@@ -16,10 +16,10 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import concatenate
-from sfm_shapefit.pipeline import execution
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import (
     WorkerError,
+    interrupts_wait,
     measure_part,
     measure_with_workers,
     open_executor,
@@ -133,7 +133,7 @@ def test_an_interrupt_while_a_cluster_opens_comes_when_it_can_be_closed():
     done, before = [], signal.getsignal(signal.SIGINT)
 
     def open_cluster():
-        with execution._interrupts_wait():
+        with interrupts_wait():
             signal.raise_signal(signal.SIGINT)
             done.append(1)
 
