@@ -1,7 +1,6 @@
 """A reconstruction as an adjustment problem and back: every lens, rigs, fixed frames, tracks."""
 
 import itertools
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +12,7 @@ from sfm_shapefit import InputError
 from sfm_shapefit.adjustment import run as adjustment_run
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement, adjust_thinly
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
-from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
+from sfm_shapefit.adjustment.solve import reprojection_errors_px
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.points import points_of
@@ -264,30 +263,6 @@ def test_coarse_poses_are_told_from_fine_ones_and_solved_again_from_the_points_o
     _, last = adjustment_run.solve_thinly_again(run)
     if is_coarse:
         np.testing.assert_array_equal(last.centers, adjustment_run.solve_twice_thinly(run)[1].centers)
-
-
-def test_lenses_that_were_found_before_are_held_in_the_first_solve_and_damped_in_the_second(monkeypatch):
-    frees, dampings = [], []
-
-    def noting(problem, options, **others):
-        frees.append(others["free_focal_lengths"])
-        dampings.append(others["first_damping"])
-        return adjust(problem, options, **others)
-
-    monkeypatch.setattr(adjustment_run, "adjust", noting)
-    truth = scene("RADIAL")
-    images, links = posed_images(disturbed(truth)), links_of(truth, truth)
-    (given,) = images.lenses
-    found, free = (
-        replace(given, parameters=(401.0, *given.parameters[1:])),
-        Freedom(parts=np.array([True, False])),
-    )
-    for one, is_free in ((given, True), (found, False)):
-        adjust_thinly(images.with_lenses([one]), lambda: links, StructureOptions(), free, lenses_wanted=True)
-        assert frees[:2] == [is_free, True]
-        assert dampings[:2] == [1e-4, 1e-8 if is_free else 1e-4]
-        frees.clear()
-        dampings.clear()
 
 
 @pytest.mark.parametrize(

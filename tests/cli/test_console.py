@@ -104,14 +104,14 @@ def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed_and_elsewhe
 
 @pytest.mark.parametrize("verbose", [False, True])
 def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, capfd, monkeypatch, verbose):
-    read = model._posed_model
+    read = model.read_folder
 
     def talkative(*arguments):
         with quiet_log():  # as every call of pycolmap is
             pycolmap.logging.warning("these images are of the past")
         return read(*arguments)
 
-    monkeypatch.setattr(model, "_posed_model", talkative)
+    monkeypatch.setattr(model, "read_folder", talkative)
     command = ["locate", RING / "sparse/0", tmp_path / "out", "--adjust", "full", "--no-report"]
     done = run(*command, *["--verbose"] * verbose, code=0)
     native = capfd.readouterr().err
