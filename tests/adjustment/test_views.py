@@ -235,8 +235,9 @@ def test_pixels_of_matches_are_held_in_32_bits_only_if_these_hold_all_of_them(ex
             image.points2D[k].xy = wanted.astype(np.float64)
     found = matches_of(model)
     assert found.pixels.dtype == (np.float32 if exact else np.float64)
-    own = [model.image(int(posed_images(model).ids[i])) for i in found.cameras]
-    at = [image.points2D[k].xy for image, k in zip(own, found.keypoints.tolist(), strict=True)]
+    ids = posed_images(model).ids.tolist()
+    pixels = [np.array([point.xy for point in model.image(one).points2D]) for one in ids]
+    at = [pixels[i][k] for i, k in zip(found.cameras.tolist(), found.keypoints.tolist(), strict=True)]
     np.testing.assert_array_equal(found.pixels, at)
 
 
