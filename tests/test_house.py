@@ -6,6 +6,9 @@ and in no others. A feature that is spread over the house makes its list longer 
 Something else that adjustments may free is a part of lenses, as the distortion is: principal points were
 freed on a branch of their own, which edited these five files. Another pose, as that of a sensor in its rig,
 has unknowns, a gauge and standard deviations of its own, and is spread as wide as its last list says.
+
+Tests that patch what they test, or call what is private, hold up a change and guard nothing that a user
+would notice: they are counted.
 """
 
 import ast

@@ -118,12 +118,12 @@ def test_acceleration_that_leads_astray_is_given_up_and_the_answer_is_exact():
     assert np.linalg.norm(shape(solve_admm(graph, 1e-14, 2000).locations) - shape(t)) < 1e-9
 
 
-@pytest.mark.parametrize("tol", [1e-3, 1e-5])
-def test_the_error_that_the_splitting_estimates_is_about_the_true_one(tol):
-    edges, t = geo(300, 24, 5)
-    graph = measure_graph(edges, t, sigma=0.02, q=0.1, seed=5)
-    best = objective(graph, solve_admm(graph, 1e-9, 2000).locations)
-    assert objective(graph, solve_admm(graph, tol, 2000).locations) < best * (1.0 + 3.0 * tol)
+def test_the_splitting_goes_on_where_many_small_steps_are_left():
+    """On loose communities ten steps of the present length are not nearly all that is left."""
+    graph = measure_graph(*comm(600, 12, 1), sigma=0.05, q=0.1, seed=1)
+    best = objective(graph, solve_admm(graph, 1e-9, 3000).locations)
+    # Measured: 0.09 of the tolerance; 0.47 if the step alone is looked at.
+    assert objective(graph, solve_admm(graph, 1e-4, 2000).locations) < best * (1.0 + 0.3e-4)
 
 
 def test_the_number_of_iterations_does_not_grow_with_the_number_of_cameras():
