@@ -64,6 +64,8 @@ BUDGET_S = 30.0
 PATIENCE, LOADING_S = 3, 30
 """A mutant is endless after so many times the tests' own time, and the seconds that loading may take."""
 OPTIONS = ("-s", "-p", "no:cacheprovider", "-o", "addopts=", "--tb=native", "-W", "ignore")
+PROFILE = "mutation"
+"""Of Hypothesis; the option of pytest outdoes the profile that `tests/conftest.py` loads."""
 
 
 class Mutant(NamedTuple):
@@ -261,11 +263,10 @@ def run_tests(
     # A failure need not be made small.
     phases = (hypothesis.Phase.explicit, hypothesis.Phase.generate)
     settings = {"derandomize": True, "database": None, "deadline": None}
-    hypothesis.settings.register_profile("mutation", phases=phases, **settings)
-    hypothesis.settings.load_profile("mutation")
+    hypothesis.settings.register_profile(PROFILE, phases=phases, **settings)
     watch = Watch(longest_s)
     with contextlib.redirect_stdout(io.StringIO()):
-        code = pytest.main([*OPTIONS, *words], plugins=[watch])
+        code = pytest.main([*OPTIONS, f"--hypothesis-profile={PROFILE}", *words], plugins=[watch])
     if code not in (0, 1):
         watch.failed.append(f"pytest ended with code {int(code)}")
     return watch

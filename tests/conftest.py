@@ -4,6 +4,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 import sfm_shapefit
 from sfm_shapefit.synthetic import (
@@ -20,6 +21,10 @@ from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.scenes import COURTYARD, RING
 
 pytest_plugins = ["pytester", "sfm_shapefit.synthetic.fixtures"]
+
+# The same examples in each run, however slow the machine is.
+settings.register_profile("suite", deadline=None, derandomize=True)
+settings.load_profile("suite")
 
 # A shell starts background jobs with interrupts ignored, and their children inherit that: commands that the
 # tests interrupt would never end.

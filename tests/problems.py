@@ -21,7 +21,7 @@ from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.splitting.engine import Goal
-from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources
+from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources, laplacian_factor
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.solver.splitting.split_then_newton import AdmmResult, Splitting
 
@@ -209,6 +209,22 @@ def solve_admm(
         return splitting.run(Goal(tol, 0.0, max_iterations), on_iteration)
     finally:
         splitting.close()
+
+
+class CountedFactor:
+    """A factor of a graph's scalar Laplacian that counts what is asked of it."""
+
+    def __init__(self, graph: ViewGraph) -> None:
+        self._factor = laplacian_factor(graph)
+        self.refactored = self.solved = 0
+
+    def refactor(self, weights: Floats) -> None:
+        self.refactored += 1
+        self._factor.refactor(weights)
+
+    def solve(self, rhs: Floats) -> Floats:
+        self.solved += 1
+        return self._factor.solve(rhs)
 
 
 def lud_over(graph: ViewGraph, groups: RigidGroups, steps: int = 150) -> Floats:

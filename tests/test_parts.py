@@ -245,7 +245,7 @@ def among(said, members):
 
 
 @pytest.mark.parametrize("name", NOUNS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), data=st.data())
 def test_a_part_of_a_part_is_a_part_and_says_the_same_of_what_it_has(name, seed, data):
     noun, everyone = NOUNS[name], np.arange(N)

@@ -12,7 +12,6 @@ from contextlib import closing
 import pytest
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap import sqlite_file
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.read_binary import read_folder
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
@@ -77,8 +76,10 @@ def test_a_database_is_opened_for_reading_without_trust_and_with_limits():
         connection = file.connection
         assert connection.execute("PRAGMA trusted_schema").fetchone() == (0,)
         assert connection.execute("PRAGMA query_only").fetchone() == (1,)
-        for limit, value in sqlite_file._LIMITS.items():
-            assert connection.getlimit(limit) == value
+        assert connection.getlimit(sqlite3.SQLITE_LIMIT_LENGTH) == 2**29
+        assert connection.getlimit(sqlite3.SQLITE_LIMIT_VDBE_OP) == 10_000
+        for limit in (sqlite3.SQLITE_LIMIT_ATTACHED, sqlite3.SQLITE_LIMIT_WORKER_THREADS):
+            assert connection.getlimit(limit) == 0
         with pytest.raises(sqlite3.OperationalError, match="readonly"):
             connection.execute("DELETE FROM images")
         with pytest.raises(sqlite3.Error):

@@ -266,8 +266,8 @@ def run(args: argparse.Namespace) -> int:
     recorded = read(args.out) if args.resume and args.out.exists() else {}
     args.out.parent.mkdir(parents=True, exist_ok=True)
     write(args.out, recorded)
-    chosen = choose(_folders(args.data), only=args.only, quick=args.quick, done=recorded)
-    for answers in record(args.package, _folders(args.data), chosen, jobs=args.jobs):
+    chosen = choose(folders_of(args.data), only=args.only, quick=args.quick, done=recorded)
+    for answers in record(args.package, folders_of(args.data), chosen, jobs=args.jobs):
         write(args.out, answers, mode="at")
         recorded |= answers
     skipped = {name: answer["skipped"] for name, answer in recorded.items() if "skipped" in answer}
@@ -317,7 +317,7 @@ def record(
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _folders(data: Path) -> dict[str, Path]:
+def folders_of(data: Path) -> dict[str, Path]:
     """Return the folders of scenes and sets that are at hand, by name."""
     found = {name: ROOT / "data_synthetic" / name for name in BUNDLED}
     for folder in sorted(data.glob("*")):

@@ -124,10 +124,10 @@ def _similarity(step: FloatArray, origin: FloatArray) -> FloatArray:
     generator = np.zeros((4, 4))
     generator[:3, :3] = cross_matrices(step[None, 3:6])[0] + step[6] * np.eye(3)
     generator[:3, 3] = step[:3] - generator[:3, :3] @ origin
-    return _exponential(generator)
+    return exponential(generator)
 
 
-def _exponential(generator: FloatArray) -> FloatArray:
+def exponential(generator: FloatArray) -> FloatArray:
     """Return exp(A) of a small square matrix, by its series for A / 2^k and k squarings."""
     squarings = max(0, math.ceil(math.log2(max(float(np.abs(generator).sum()), 0.25))) + 2)
     scaled = generator / 2.0**squarings

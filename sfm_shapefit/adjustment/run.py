@@ -147,7 +147,7 @@ class AdjustmentRun:
             error_px = self.options.max_reprojection_error_px
             joined, found = triangulate_matches(self.links, poses, limits, error_px, threads)
         frames = self.images.frame_of[views_of(self.images).images[joined.cameras]]
-        return joined, _without_lone_frames(found, frames, limits.min_length)
+        return joined, without_lone_frames(found, frames, limits.min_length)
 
     def problem(self, tracks: ObservedTracks, found: TriangulatedPoints) -> AdjustmentProblem:
         """Return the problem of points that were triangulated from tracks, at the poses of the images."""
@@ -329,7 +329,7 @@ class AdjustmentRun:
 Solved = tuple[AdjustmentRun, AdjustmentProblem]
 
 
-def _without_lone_frames(found: TriangulatedPoints, frames: IntArray, least: int) -> TriangulatedPoints:
+def without_lone_frames(found: TriangulatedPoints, frames: IntArray, least: int) -> TriangulatedPoints:
     """Return points of at least so many observations (m,), of which no frame (m,) has a single one.
 
     Where it may move, such a frame and its point run into another camera of that point: nothing is missed

@@ -25,7 +25,7 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -69,17 +69,17 @@ def choose_target() -> str:
     if config.CPU_NAME == "host":
         config.CPU_NAME = config.CPU_FEATURES = None
     elif config.CPU_NAME is None:
-        config.CPU_NAME, config.CPU_FEATURES = _portable_target(), ""
+        config.CPU_NAME = portable_target(platform.machine(), sys.platform, llvm.get_host_cpu_features)
+        config.CPU_FEATURES = ""
     return config.CPU_NAME or str(llvm.get_host_cpu_name())
 
 
-def _portable_target() -> str:
-    """Return the name of the least processor of this machine's kind."""
-    machine = platform.machine().lower()
-    if machine in ("x86_64", "amd64"):
-        features = llvm.get_host_cpu_features()
+def portable_target(machine: str, system: str, read_features: Callable[[], Mapping[str, bool]]) -> str:
+    """Return the name of the least processor of a machine's kind; that of x86-64 depends on its features."""
+    if machine.lower() in ("x86_64", "amd64"):
+        features = read_features()
         return "x86-64-v3" if all(features.get(name) for name in _X86_64_V3) else "generic"
-    return "apple-m1" if (sys.platform, machine) == ("darwin", "arm64") else "generic"
+    return "apple-m1" if (system, machine.lower()) == ("darwin", "arm64") else "generic"
 
 
 @contextmanager

@@ -83,7 +83,7 @@ class Run(Generic[S]):
             stages = ", ".join(f"{stage} {s:.2f}" for stage, s in (known | {"start and write": rest}).items())
             print_table(str(source), [*told.details, row("seconds", stages)], told.elsewhere)
         black = "" if self.flags.images or has_colors(found) else _BLACK
-        print_answer(told._replace(rows=[*told.rows, row("colors", black)]), self._describe_time())
+        print_answer(told._replace(rows=[*told.rows, row("colors", black)]), self.describe_time())
         opened = f"; open {first_of([*map(shlex.quote, pages)])}" if self.flags.report else ""
         images = self.flags.images if self._has_pictures(found.image_names) else ""
         step = _with_folders(told.step.command, out / told.folders[0], images or "IMAGES")
@@ -94,7 +94,8 @@ class Run(Generic[S]):
 
         return any(file_of(Path(self.flags.images), name) for name in names)
 
-    def _describe_time(self) -> str:
+    def describe_time(self) -> str:
+        """Return the seconds since the start, and how many of them went into compiling if that is noticed."""
         total = f"{time.perf_counter() - self.started:.1f} s"
         compiling = 0.0 if self.compiling is None else self.compiling.seconds
         if compiling >= _NOTICED_S:

@@ -48,7 +48,7 @@ def gather_evidence(
     Images and `fits`, those of all pairs, are at the rotations of the model; None if no pair has a direction.
     """
     points, images, pictures, among, asked = structure
-    _, lenses = question_lenses(points, images, pictures, threads, among, _ask_some(images, asked))
+    _, lenses = question_lenses(points, images, pictures, threads, among, images_to_ask(images, asked))
     bogus = np.array([is_bogus(lens) for lens in images.lenses], dtype=np.bool_)
     odd = (*find_odd_lenses(images, points, pictures, bogus), *find_flights(images))
     if fits is None:
@@ -186,7 +186,7 @@ def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:
     return np.concatenate([np.column_stack([rows[step:], rows[:-step]]) for step in (1, 2)])
 
 
-def _ask_some(images: Images, asked: BoolArray | None) -> BoolArray | None:
+def images_to_ask(images: Images, asked: BoolArray | None) -> BoolArray | None:
     """Return which images (i,) are asked for their focal length: of a lens that took very many, only some.
 
     Panoramas have none.
@@ -240,7 +240,7 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
         known.append(tied[tied[:, 0] != tied[:, 1]])
     together = np.concatenate([np.zeros((0, 2), dtype=np.int64), *known])
     group = rigid_groups(len(images.frames.ids), rays, together)
-    lost = _are_lost(source.view, structure, fitting, group[frames])
+    lost = lost_points(source.view, structure, fitting, group[frames])
     rays = rays._replace(fits=fitting & ~lost[rays.points])
     tied, groups = find_groups(group, rays, pairs)
     posed, of = np.unique(frames[images.is_posed]), tied[frames]
@@ -257,7 +257,7 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
     return of, tuple(one._replace(cameras=cameras) for one, cameras in zip(groups, rows, strict=True))
 
 
-def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray) -> BoolArray:
+def lost_points(view: View, structure: Structure, fits: BoolArray, group: IntArray) -> BoolArray:
     """Return which points (x,) only pairs carry between groups of images (i,) whose matches mostly miss.
 
     Some matches of a pair that repeated structure has made may fit where it puts a group; others, of points

@@ -91,7 +91,7 @@ def open_executor(name: str, workers: int) -> Iterator[Executor | None]:
 
 
 @contextmanager
-def _interrupts_wait() -> Iterator[None]:
+def interrupts_wait() -> Iterator[None]:
     """Let an interrupt come at the end of the block; a cluster that is half open cannot be closed."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -117,7 +117,7 @@ def _dask_client(workers: int, scheduler: str) -> Iterator[Any]:
         from sfm_shapefit.base.process_pool import children_are_not_interrupted
 
         with ExitStack() as opened:
-            with _interrupts_wait(), children_are_not_interrupted():
+            with interrupts_wait(), children_are_not_interrupted():
                 # The port of the dashboard is taken where another run has a cluster.
                 local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")
                 client = opened.enter_context(Client(opened.enter_context(local)))

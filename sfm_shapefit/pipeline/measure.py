@@ -74,7 +74,7 @@ def measure(
     Raises:
         UnsolvableError: if no pair has a match.
     """
-    beside = _SideResults(source, options.inlier_threshold_px, wanted, clock.threads)
+    beside = SideResults(source, options.inlier_threshold_px, wanted, clock.threads)
     without = source.pairs_of_fixed
     if clock.executor is not None and source.has_database:
         parts = measure_with_workers(source.view, partial(estimate_directions, options=options), clock)
@@ -125,7 +125,7 @@ def are_sampled(num_usable: int, num_pairs: int) -> bool:
     return num_usable <= _MAX_SAMPLED_PAIRS and num_pairs <= _MOST_PAIRS
 
 
-class _SideResults:
+class SideResults:
     """Tracks, errors and counts that each batch adds to."""
 
     def __init__(

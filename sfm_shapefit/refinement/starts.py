@@ -257,7 +257,7 @@ def _find_best_fit(problem: _Problem, options: PlacementOptions) -> _Kept:
         starts.append(_refine_start(refining, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(measured, starts)
     costs = {start.name: robust_cost(measured, start.best, levels) for start in starts}
-    chosen, reason = _choose(measured.graph, starts, costs, apart, options)
+    chosen, reason = choose_start(measured.graph, starts, costs, apart, options)
     if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
     if reweighted is None:
@@ -573,14 +573,14 @@ def _common_levels(measured: MeasuredGraph, starts: list[Start]) -> FloatArray:
     return np.asarray(np.min(ended, axis=0))
 
 
-def _choose(
+def choose_start(
     graph: ViewGraph,
     starts: list[Start],
     costs: dict[str, float],
     apart: float | None,
     options: PlacementOptions,
 ) -> tuple[Start, str]:
-    """Return the start to keep and the reason."""
+    """Return the start to keep by its robust cost, and the reason; `apart` is how far two disagree."""
     by_name = {start.name: start for start in starts}
     if options.objective == "shapefit":
         return by_name["ShapeFit"], "the certified ShapeFit optimum, as asked"

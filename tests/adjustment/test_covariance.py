@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import covariance
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.gauge import free_similarities, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.solve import adjust, linearize_all, values_of
-from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.adjustment.made import observed, ring_problem
@@ -146,17 +144,13 @@ def test_centers_relative_to_frames_that_are_told_are_known_relative_to_these():
     assert sizes[deciding].max() < sizes[~deciding].min()
 
 
-@pytest.mark.parametrize("motions", [np.zeros((4, 6, 7)), np.full((4, 6, 7), np.nan)])
-def test_nodes_that_do_not_tell_the_motions_are_no_gauge(motions):
-    with pytest.raises(UnsolvableError, match="do not stand apart"):
-        covariance._dual(motions, np.arange(4))
-
-
-def test_motions_of_nodes_far_from_the_others_are_read_where_rotations_are_held():
-    # The scale moves the nodes by a million units, and one another by one: a ratio of squares of 1e-12.
-    motions = np.zeros((5, 6, 4))
-    motions[:, :3, :3] = np.eye(3)
-    motions[:4, :3, 3] = np.random.default_rng(0).normal([1e6, 0.0, 0.0], size=(4, 3))
-    dual = covariance._dual(motions, np.arange(4))
-    # Rounding of 1e-16 times the ratio of lengths, times those of the motions.
-    np.testing.assert_allclose(np.einsum("nai,naj->ij", dual, motions), np.eye(4), atol=1e-3)
+def test_a_scene_far_from_its_origin_has_the_same_covariances_where_rotations_are_held():
+    """The scale moves its frames by a million units, and one another by one: a ratio of squares of 1e-12."""
+    problem, held = (
+        ring_problem(np.random.default_rng(1), 12, 200, share=0.8),
+        replace(PLAIN, hold_rotations=True),
+    )
+    shift = np.array([1e6, 0.0, 0.0])
+    far = replace(problem, centers=problem.centers + shift, points=problem.points + shift)
+    near, there = (estimate_covariances(one, held).centers for one in (problem, far))
+    np.testing.assert_allclose(there, near, rtol=1e-2, atol=1e-3 * np.abs(near).max())

@@ -1,7 +1,6 @@
 """A reconstruction as an adjustment problem and back: every lens, rigs, fixed frames, tracks."""
 
 import itertools
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,22 +10,21 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit import InputError
 from sfm_shapefit.adjustment import run as adjustment_run
-from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
+from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement, adjust_thinly
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
-from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
+from sfm_shapefit.adjustment.solve import reprojection_errors_px
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.points import points_of
-from sfm_shapefit.scene import lens
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 from tests.models import arrays, centers_of
 from tests.scenes import BUNDLED
 from tests.structures import (
-    adjusted_placement,
     adjusted_thinly,
     bundle_adjusted,
+    in_doubt,
     links_of,
     matches_between,
     posed_images,
@@ -237,8 +235,9 @@ def test_pixels_of_matches_are_held_in_32_bits_only_if_these_hold_all_of_them(ex
             image.points2D[k].xy = wanted.astype(np.float64)
     found = matches_of(model)
     assert found.pixels.dtype == (np.float32 if exact else np.float64)
-    own = [model.image(int(posed_images(model).ids[i])) for i in found.cameras]
-    at = [image.points2D[k].xy for image, k in zip(own, found.keypoints.tolist(), strict=True)]
+    ids = posed_images(model).ids.tolist()
+    pixels = [np.array([point.xy for point in model.image(one).points2D]) for one in ids]
+    at = [pixels[i][k] for i, k in zip(found.cameras.tolist(), found.keypoints.tolist(), strict=True)]
     np.testing.assert_array_equal(found.pixels, at)
 
 
@@ -253,53 +252,18 @@ def test_thin_adjustment_straightens_coarse_poses(source):
     assert errors[1] < 0.2 * errors[0]
 
 
-@pytest.mark.parametrize(("size", "limits"), [(0.0, [1.0]), (0.02, [1.0, 4.0])])
-def test_points_at_the_wide_limit_are_looked_for_only_where_poses_may_be_coarse(monkeypatch, size, limits):
-    found = []
-
-    def noting(run, widening, **others):
-        found.append(widening)
-        return triangulate(run, widening, **others)
-
-    triangulate = adjustment_run.AdjustmentRun.triangulate
-    monkeypatch.setattr(adjustment_run.AdjustmentRun, "triangulate", noting)
+@pytest.mark.parametrize(("size", "is_coarse"), [(0.0, False), (0.02, True)])
+def test_coarse_poses_are_told_from_fine_ones_and_solved_again_from_the_points_of_the_wide_limit(
+    size, is_coarse
+):
     truth = scene()
     images, links = posed_images(disturbed(truth, size=size)), links_of(truth, matches_of(truth))
     run = adjustment_run.begin(images, links, StructureOptions(), Freedom(), GivenPoses())
     fine, coarse = adjustment_run.problem_of_poses(run)
-    assert (fine is None, coarse is None) == (size > 0.0, size == 0.0)
-    assert found == limits
+    assert (fine is None, coarse is None) == (is_coarse, not is_coarse)
     _, last = adjustment_run.solve_thinly_again(run)
-    assert found == [*limits, *limits, *[1.0] * (size > 0.0)]  # what is known to be coarse is not found anew
-    if size > 0.0:  # and the answer is the same
+    if is_coarse:
         np.testing.assert_array_equal(last.centers, adjustment_run.solve_twice_thinly(run)[1].centers)
-
-
-def test_lenses_that_were_found_before_are_held_in_the_first_solve_and_damped_in_the_second(monkeypatch):
-    frees, dampings = [], []
-
-    def noting(problem, options, **others):
-        frees.append(others["free_focal_lengths"])
-        dampings.append(others["first_damping"])
-        return adjust(problem, options, **others)
-
-    monkeypatch.setattr(adjustment_run, "adjust", noting)
-    truth = scene("RADIAL")
-    images, links = posed_images(disturbed(truth)), links_of(truth, truth)
-    (given,) = images.lenses
-    found, free = (
-        replace(given, parameters=(401.0, *given.parameters[1:])),
-        Freedom(parts=np.array([True, False])),
-    )
-    for one, is_free in ((given, True), (found, False)):
-        adjust_thinly(
-            adjustment_run.begin(images.with_lenses([one]), links, StructureOptions(), free),
-            lenses_wanted=True,
-        )
-        assert frees[:2] == [is_free, True]
-        assert dampings[:2] == [1e-4, 1e-8 if is_free else 1e-4]
-        frees.clear()
-        dampings.clear()
 
 
 @pytest.mark.parametrize(
@@ -321,7 +285,7 @@ def test_where_lenses_of_few_images_are_left_open_nothing_is_solved_again_if_mor
 
 
 @pytest.mark.parametrize("source", ["matches", "tracks"])
-def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(source, monkeypatch):
+def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(source):
     truth = scene("RADIAL")
     start = disturbed(truth)
     start.camera(1).params = np.array([460.0, 320.0, 240.0, 0.0, 0.0])
@@ -332,32 +296,28 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
     assert not found.estimate.undetermined.any()
     assert 0.0 < found.estimate.focal_sigmas[0] < 0.01
-    monkeypatch.setattr(lens, "_SHARED_NOISE", 1e9)
-    held = adjusted_thinly(start, tracks, **free)
-    assert held.estimate.undetermined.all()
-    assert held.estimate.freedom.parts.tolist() == [[False, True]]
-    assert not held.estimate.is_refined.any()
-    given, kept = (model.camera(1).params.tolist() for model in (start, held.reconstruction))
-    assert kept[:3] == given[:3]
-    assert kept[3] != 0.0  # the distortion is told, and held no more than its prior does
+    start.camera(1).params = np.array([400.5, 320.0, 240.0, 0.0, 0.0])
+    images, links = posed_images(start), links_of(start, tracks)
+    known = images.with_lenses([in_doubt(lens, focal_sigma=2e-3) for lens in images.lenses])
+    held = adjust_thinly(known, lambda: links, StructureOptions(), Freedom(**free), lenses_wanted=True)
+    assert held.undetermined.all()  # the matches know it no better than it was given
+    assert held.freedom.parts.tolist() == [[False, True]]
+    assert not held.is_refined.any()
+    (given,), (kept,) = (one.lenses for one in (images, held.images))
+    assert kept.parameters[:3] == given.parameters[:3]
+    assert kept.parameters[3] != 0.0  # the distortion is told, and held no more than its prior does
     again = adjusted_thinly(start, tracks, parts=np.array([False, True]))
-    assert again.reconstruction.camera(1).params.tolist()[:3] == given[:3]
-    monkeypatch.setattr(lens, "_MOST_DISTORTION", 0.0)
-    held = adjusted_thinly(start, tracks, **free)
-    assert held.estimate.undetermined.all()
-    assert not held.estimate.is_refined.any()  # nor has it a standard deviation
-    assert held.reconstruction.camera(1).params.tolist() == given
+    assert tuple(again.reconstruction.camera(1).params[:3]) == given.parameters[:3]
 
 
-def test_a_placement_is_adjusted_though_its_only_lens_in_doubt_is_left_open(monkeypatch):
-    truth = scene("PINHOLE")
-    start = disturbed(truth)
-    free = {"parts": np.ones(2, bool)}
-    monkeypatch.setattr(lens, "_SHARED_NOISE", 1e9)
-    found = adjusted_placement(start, matches_of(truth), **free)
-    assert found.estimate.undetermined.all()
-    given, kept = (model.camera(1).params.tolist() for model in (start, found.reconstruction))
-    assert kept == given
+def test_a_placement_is_adjusted_though_its_only_lens_in_doubt_is_left_open():
+    start = disturbed(scene("PINHOLE"))
+    images, links = posed_images(start), links_of(start, matches_of(scene("PINHOLE")))
+    known = images.with_lenses([in_doubt(lens, focal_sigma=1e-4) for lens in images.lenses])
+    free = Freedom(parts=np.ones(2, bool))
+    found = adjust_placement(known, links, StructureOptions(), free, GivenPoses())
+    assert found.undetermined.all()
+    assert [lens.parameters for lens in found.images.lenses] == [lens.parameters for lens in images.lenses]
 
 
 def test_points_of_two_images_hold_cameras_but_are_not_in_the_model():

@@ -5,7 +5,6 @@ from threading import Event, get_ident
 
 import pytest
 
-from sfm_shapefit.base import executors
 from sfm_shapefit.base.executors import WorkerError, answers, in_ranges, in_threads, made_ahead
 
 
@@ -57,13 +56,12 @@ def test_one_item_is_made_while_another_is_used(threads):
         next(items)
 
 
-def test_tasks_are_made_only_a_few_ahead_of_the_answers(monkeypatch):
-    monkeypatch.setattr(executors, "_TASKS_AT_ONCE", 4)
+def test_tasks_are_made_only_a_few_ahead_of_the_answers():
     made = []
     with ThreadPoolExecutor(2) as pool:
-        for task, _ in answers(pool, square, (made.append(k) or k for k in range(50))):
-            assert len(made) <= task + 4
-    assert made == list(range(50))
+        for task, _ in answers(pool, square, (made.append(k) or k for k in range(100))):
+            assert len(made) <= task + 32
+    assert made == list(range(100))
 
 
 def test_what_is_not_asked_for_any_more_is_cancelled():

@@ -153,7 +153,7 @@ def test_coincident_points_are_mapped_onto_each_other_with_scale_one(fit, n):
 
 
 @given(seed=seeds, n=st.integers(3, 30))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_an_exact_similarity_is_found_by_l1_too(seed, n):
     rng = np.random.default_rng(seed)
     true = random_similarity(rng)
@@ -236,7 +236,7 @@ def test_rotation_angles_are_exact_at_0_and_at_180_degrees_too(angle):
 
 
 @given(seed=seeds, n=st.integers(3, 40))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_majority_of_equal_rotations_is_the_mean_whatever_the_others_are(seed, n):
     rng = np.random.default_rng(seed)
     true = random_rotation(rng)
@@ -265,7 +265,7 @@ def test_the_mean_rotation_turns_with_its_inputs_and_that_of_one_is_itself():
     np.testing.assert_allclose(mean_rotation_l1(left[None]), left, atol=4 * EPS)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=seeds, d=st.integers(2, 5))
 def test_similarities_compose_like_maps_and_their_inverses_undo_them(seed, d):
     rng = np.random.default_rng(seed)

@@ -1,19 +1,19 @@
 """Where compiled kernels are kept: found again wherever they are copied, never stale, never damaged."""
 
-import sys
-from weakref import WeakValueDictionary
+import inspect
+import shutil
 
 import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
 from numba.core import config
-from numba.core.environment import Environment
 
 from sfm_shapefit.base import kernel_cache
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.base.kernel_cache import KernelCache, hear_of_kernels, is_noted, note, on_miss, stamp_of
+from sfm_shapefit.base.kernel_cache import hear_of_kernels, is_noted, note, on_miss
 from tests.program import run_python
+from tests.scenes import ROOT
 
 
 def double(x):
@@ -78,16 +78,41 @@ def test_a_kernel_is_loaded_without_its_llvm_code_and_taken_into_another_with_it
     assert len(read) == 2
 
 
-def test_a_kernel_is_loaded_without_the_modules_of_the_functions_that_it_calls(folder, monkeypatch):
-    kernel(allocate)(3)
-    monkeypatch.setattr(Environment, "_memo", WeakValueDictionary())  # as in another process
-    monkeypatch.delitem(sys.modules, "numba.np.arrayobj")
-    with on_miss(lambda: pytest.fail("missed")):
-        loaded = kernel(allocate)
-        assert loaded(3) == 3
-    with pytest.raises(ValueError, match="negative"):
-        loaded(-1)
-    assert "numba.np.arrayobj" not in sys.modules
+LOAD = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import made
+from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.kernel_cache import on_miss
+missed = []
+with on_miss(lambda: missed.append(1)):
+    loaded = kernel(made.allocate)
+    print(loaded(3), len(missed), "numba.np.arrayobj" in sys.modules)
+try:
+    loaded(-1)
+except ValueError as error:
+    print(error)
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Return what another process says that calls `allocate`, of a module of its own."""
+    source = inspect.getsource(allocate)
+
+    def say(returns="size"):
+        text = f"import numpy as np\n\n\n{source.replace('size', returns)}"
+        (tmp_path / "made.py").write_text(text)
+        done = run_python("-c", LOAD, tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+        assert done.returncode == 0, done.stderr
+        return done.stdout.splitlines()
+
+    return say
+
+
+def test_a_kernel_is_loaded_without_the_modules_of_the_functions_that_it_calls(load):
+    negative = "negative dimensions not allowed"
+    assert [load(), load()] == [["3 1 True", negative], ["3 0 False", negative]]
 
 
 @pytest.mark.parametrize("content", [b"", b"no pickle", b"cut"])
@@ -101,18 +126,16 @@ def test_a_damaged_file_is_compiled_anew(folder, content):
     assert kept(folder) == [file]
 
 
-def test_another_source_leaves_nothing_of_the_earlier_one(folder, monkeypatch):
-    compile_double()
-    (file,) = kept(folder)
-    monkeypatch.setattr(kernel_cache, "stamp_of", lambda _path: "another")
-    assert compile_double()
-    (now,) = kept(folder)
-    assert now != file
+def test_another_source_leaves_nothing_of_the_earlier_one(load, tmp_path):
+    assert load()[0].startswith("3 1")
+    before = kept(tmp_path / "cache")
+    assert load("ndim")[0].startswith("1 1")
+    assert len(kept(tmp_path / "cache")) == len(before)
+    assert not set(kept(tmp_path / "cache")) & set(before)
 
 
-def test_a_kernel_works_where_nothing_can_be_kept(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("no folder")
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "file" / "below"))
+def test_a_kernel_works_where_nothing_can_be_kept(folder):
+    folder.write_text("no folder")
     assert compile_double()
     assert compile_double()
 
@@ -121,19 +144,6 @@ def test_a_kernel_without_a_source_works(folder):
     scope = {}
     exec("def triple(x): return 3 * x", scope)
     assert kernel(scope["triple"])(14) == 42
-    assert kept(folder) == []
-
-
-def test_kernels_of_a_wheel_are_read_and_nothing_is_written(folder, tmp_path, monkeypatch):
-    compile_double()
-    (file,) = kept(folder)
-    shipped = tmp_path / "shipped" / "_kernels"
-    shipped.mkdir(parents=True)
-    file.rename(shipped / file.name)
-    own = kernel_cache.Path(__file__).resolve().parent
-    monkeypatch.setattr(kernel_cache, "PACKAGE", own)
-    monkeypatch.setattr(kernel_cache, "SHIPPED", shipped)
-    assert not compile_double()
     assert kept(folder) == []
 
 
@@ -147,39 +157,42 @@ def test_what_is_missed_once_is_looked_for_again(folder):
     assert kept(folder) == [file]
 
 
-def test_a_stamp_covers_what_a_module_imports_also_through_others(tmp_path, monkeypatch):
-    monkeypatch.setattr(kernel_cache, "PACKAGE", tmp_path)
-    (tmp_path / "room").mkdir()
+STAMP = "from sfm_shapefit.base import kernel_cache as c; print(c.stamp_of(c.PACKAGE / 'top.py'))"
+
+
+def test_a_stamp_covers_what_a_module_imports_also_through_others(tmp_path):
+    package = tmp_path / "sfm_shapefit"
+    shutil.copytree(ROOT / "sfm_shapefit" / "base", package / "base", ignore=shutil.ignore_patterns("__py*"))
     files = {
+        "__init__.py": "",
         "top.py": "from sfm_shapefit.room import pair\nfrom os import path\n",
         "room/__init__.py": "from sfm_shapefit.room.pairs import Pair\n",
         "room/pairs.py": "class Pair: ...\n",
         "other.py": "",
     }
+    (package / "room").mkdir()
     for name, text in files.items():
-        (tmp_path / name).write_text(text)
+        (package / name).write_text(text)
 
     def stamp():
-        stamp_of.cache_clear()
-        kernel_cache._read.cache_clear()
-        return stamp_of(tmp_path / "top.py")
+        done = run_python("-P", "-c", STAMP, PYTHONPATH=str(tmp_path))
+        assert len(done.stdout) == 13, done.stderr
+        return done.stdout
 
     first = stamp()
-    (tmp_path / "other.py").write_text("# it has no part in it")
+    (package / "other.py").write_text("# it has no part in it")
     assert stamp() == first
-    (tmp_path / "room" / "pairs.py").write_text("class Renamed: ...\n")
+    (package / "room" / "pairs.py").write_text("class Renamed: ...\n")
     assert stamp() != first
-    stamp_of.cache_clear()
-    kernel_cache._read.cache_clear()
 
 
-def test_a_note_holds_for_its_sources_only(folder, monkeypatch):
+def test_a_note_holds_for_its_sources_only(folder):
     own = kernel_cache.PACKAGE / "pipeline"
     assert not is_noted("an example", own)
     note("an example", own)
     assert is_noted("an example", own)
-    monkeypatch.setattr(kernel_cache, "stamp_of", lambda _path: "another")
-    assert not is_noted("an example", own)
+    assert not is_noted("another", own)
+    assert not is_noted("an example", kernel_cache.PACKAGE / "solver")
 
 
 IMPORT = "import sfm_shapefit.base.jit; from numba.core import config; print(config.CPU_NAME)"
@@ -188,7 +201,7 @@ IMPORT = "import sfm_shapefit.base.jit; from numba.core import config; print(con
 @pytest.mark.parametrize(
     ("program", "environment", "expected"),
     [
-        (IMPORT, {}, kernel_cache._portable_target()),
+        (IMPORT, {}, kernel_cache.choose_target()),
         (IMPORT, {"NUMBA_CPU_NAME": "host"}, "None"),
         (IMPORT, {"NUMBA_CPU_NAME": "generic"}, "generic"),
     ],
@@ -208,12 +221,9 @@ def test_the_processor_is_the_portable_one_unless_something_else_is_asked_for(pr
         ("aarch64", "linux", "", "generic"),
     ],
 )
-def test_the_portable_target_is_the_least_of_its_kind(monkeypatch, machine, system, missing, expected):
-    features = {name: name != missing for name in kernel_cache._X86_64_V3}
-    monkeypatch.setattr(kernel_cache.platform, "machine", lambda: machine)
-    monkeypatch.setattr(kernel_cache.sys, "platform", system)
-    monkeypatch.setattr(llvm, "get_host_cpu_features", lambda: features)
-    assert kernel_cache._portable_target() == expected
+def test_the_portable_target_is_the_least_of_its_kind(machine, system, missing, expected):
+    features = dict.fromkeys(("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"), True)
+    assert kernel_cache.portable_target(machine, system, lambda: features | {missing: False}) == expected
 
 
 START = """
@@ -232,7 +242,7 @@ print(hashlib.sha256(iterate.t.tobytes() + iterate.y.tobytes()).hexdigest())
 def test_two_processors_give_the_same_bits(tmp_path):
     """The portable one and one that cannot fuse products with sums: kernels have all their options in common,
     so that one with long sums stands for them."""
-    another = "generic" if kernel_cache._portable_target() != "generic" else "host"
+    another = "generic" if kernel_cache.choose_target() != "generic" else "host"
     portable = run_python("-c", START)
     other = run_python("-c", START, NUMBA_CPU_NAME=another, NUMBA_CACHE_DIR=str(tmp_path))
     assert other.returncode == 0, other.stderr[-500:]
@@ -240,17 +250,18 @@ def test_two_processors_give_the_same_bits(tmp_path):
     assert len(other.stdout.split()) == 1
 
 
-def test_who_calls_from_python_is_told_once_that_kernels_are_compiled(monkeypatch, capsys):
-    monkeypatch.setattr(kernel_cache, "_said", [])
-    of_package, of_others = KernelCache(kernel_cache.here), KernelCache(double)
-    of_package._say_once()  # the program, which these tests load, says it itself
-    monkeypatch.delitem(sys.modules, "sfm_shapefit.cli")
-    of_others._say_once()
-    with hear_of_kernels(print):
-        of_package._say_once()
-    assert capsys.readouterr().err == ""
-    of_package._say_once()
-    of_package._say_once()
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "compiling kernels, once" in said
+CALL = """
+import numpy as np
+from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.quaternions import rotation_vectors, rotations_of
+kernel(lambda x: 2 * x)(21)  # of others
+rotation_vectors(rotations_of(np.zeros((1, 3))))  # two kernels
+"""
+
+
+@pytest.mark.parametrize(("first", "times"), [("", 1), ("import sfm_shapefit.cli", 0)])
+def test_who_calls_from_python_is_told_once_that_kernels_are_compiled(tmp_path, first, times):
+    """The program says it itself."""
+    done = run_python("-c", first + CALL, NUMBA_CACHE_DIR=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("sfm_shapefit: compiling kernels, once") == done.stderr.count("\n") == times

@@ -391,24 +391,22 @@ def test_bad_input_gets_one_sentence_and_leaves_no_trace(tmp_path):
         assert not (tmp_path / "out").exists(), what
 
 
-def test_an_interrupt_once_the_output_stands_says_that_it_is_complete(tmp_path, monkeypatch):
+@pytest.mark.parametrize("stands", [True, False])
+def test_an_interrupt_says_whether_the_output_stands(tmp_path, monkeypatch, stands):
     move = output._move_into_place
 
     def interrupted(*arguments, **how):
-        move(*arguments, **how)
+        if stands:
+            move(*arguments, **how)
         raise KeyboardInterrupt
 
-    def stopped(*_arguments, **_how):
-        raise KeyboardInterrupt
-
+    run("locate", RING_MODEL, tmp_path / "out", "--no-report", code=0)
     monkeypatch.setattr(output, "_move_into_place", interrupted)
-    for extra in ((), ("--overwrite",)):
-        said = run_refused("locate", RING_MODEL, tmp_path / "out", "--no-report", *extra, code=130)
-        assert "interrupted; the output is complete" in said
-        assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    monkeypatch.setattr(output, "_move_into_place", stopped)
     said = run_refused("locate", RING_MODEL, tmp_path / "out", "--no-report", "--overwrite", code=130)
-    assert "the output" not in said  # what stands there is the earlier one
+    assert ("interrupted; the output is complete" in said) == stands  # else the earlier one stands there
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    said = run_refused("locate", RING_MODEL, tmp_path / "new", "--no-report", code=130)
+    assert ("interrupted; the output is complete" in said) == stands == (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("extra", [(), ("--adjust", "full")])

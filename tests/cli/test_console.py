@@ -122,14 +122,14 @@ def test_without_a_terminal_a_short_run_says_nothing_and_a_long_one_a_line_for_e
 
 @pytest.mark.parametrize("verbose", [False, True])
 def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, capfd, monkeypatch, verbose):
-    read = model._posed_model
+    read = model.read_folder
 
     def talkative(*arguments):
         with quiet_log():  # as every call of pycolmap is
             pycolmap.logging.warning("these images are of the past")
         return read(*arguments)
 
-    monkeypatch.setattr(model, "_posed_model", talkative)
+    monkeypatch.setattr(model, "read_folder", talkative)
     command = ["locate", RING / "sparse/0", tmp_path / "out", "--adjust", "full", "--no-report"]
     done = run(*command, *["--verbose"] * verbose, code=0)
     native = capfd.readouterr().err
@@ -144,33 +144,6 @@ def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, capfd
     assert "bundle adjustment" in done.stdout
 
 
-def written(monkeypatch, encoding, show):
-    """Return what is shown on a stdout of some encoding."""
-    raw = io.BytesIO()
-    with monkeypatch.context() as patch:
-        patch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding=encoding))
-        show()
-        sys.stdout.flush()
-        return raw.getvalue().decode(encoding)
-
-
-def test_names_that_stdout_cannot_show_have_escapes(monkeypatch):
-    table = partial(console.print_table, "d\u00e9", [("left out", ["\u0663", "b\x1b[2J"])])
-    shown = written(monkeypatch, "ascii", table)
-    assert r"d\xe9" in shown
-    assert r"\u0663" in shown
-    assert r"b\ufffd[2J" in shown
-    assert "d\u00e9" in written(monkeypatch, "utf-8", table)
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
-def test_json_means_the_same_on_any_stdout(monkeypatch, encoding):
-    summary = {"names": ["d\u00e9", "\u0663", "\udce9"]}
-    shown = written(monkeypatch, encoding, partial(console.print_json, summary))
-    assert json.loads(shown) == summary
-    assert ("\u0663" in shown) == (encoding == "utf-8")
-
-
 class Terminal(io.TextIOWrapper):
     """A stdout that says it is a terminal."""
 
@@ -178,18 +151,44 @@ class Terminal(io.TextIOWrapper):
         return True
 
 
-def test_a_color_terminal_shows_warnings_and_verdict_in_color_unless_no_color_is_wanted(monkeypatch):
-    def shown(**environment):
-        with monkeypatch.context() as patch:
-            for name, value in ({"TERM": "xterm-256color"} | environment).items():
-                patch.setenv(name, value)
-            raw = io.BytesIO()
-            patch.setattr(sys, "stdout", Terminal(raw, encoding="utf-8"))
-            console.print_answer(Telling(["8 of 8"], [Row("warning", ["look out"])]), "3.0 s")
-            console.print_ending("look", "look at 1 camera (a.jpg)", "written to out/", "colmap")
-            sys.stdout.flush()
-            return raw.getvalue().decode()
+def shown_on(stdout, monkeypatch, show, *, encoding="utf-8", **environment):
+    """Return what is shown on a kind of stdout."""
+    raw = io.BytesIO()
+    with monkeypatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        patch.setattr(sys, "stdout", stdout(raw, encoding=encoding))
+        show()
+        sys.stdout.flush()
+        return raw.getvalue().decode(encoding)
 
+
+written = partial(shown_on, io.TextIOWrapper)
+
+
+def test_names_that_stdout_cannot_show_have_escapes(monkeypatch):
+    table = partial(console.print_table, "d\u00e9", [("left out", ["\u0663", "b\x1b[2J"])])
+    shown = written(monkeypatch, table, encoding="ascii")
+    assert r"d\xe9" in shown
+    assert r"\u0663" in shown
+    assert r"b\ufffd[2J" in shown
+    assert "d\u00e9" in written(monkeypatch, table)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_json_means_the_same_on_any_stdout(monkeypatch, encoding):
+    summary = {"names": ["d\u00e9", "\u0663", "\udce9"]}
+    shown = written(monkeypatch, partial(console.print_json, summary), encoding=encoding)
+    assert json.loads(shown) == summary
+    assert ("\u0663" in shown) == (encoding == "utf-8")
+
+
+def test_a_color_terminal_shows_warnings_and_verdict_in_color_unless_no_color_is_wanted(monkeypatch):
+    def show():
+        console.print_answer(Telling(["8 of 8"], [Row("warning", ["look out"])]), "3.0 s")
+        console.print_ending("look", "look at 1 camera (a.jpg)", "written to out/", "colmap")
+
+    shown = partial(shown_on, Terminal, monkeypatch, show, TERM="xterm-256color")
     colored = shown()
     assert "8 of 8        3.0 s\n" in colored
     assert "\x1b[1;33mwarning: look out\x1b[0m" in colored
@@ -205,30 +204,25 @@ def test_a_terminal_of_eighty_columns_has_a_usual_first_line_whole_and_never_bre
         "30 of 30 images placed, 20,937 points, mean reprojection error 0.40 px",
         f"colmap {'x ' * 60}",
     )
-    raw = io.BytesIO()
-    with monkeypatch.context() as patch:
-        patch.setenv("COLUMNS", "80")
-        patch.setenv("TERM", "xterm")
-        patch.setattr(sys, "stdout", Terminal(raw, encoding="utf-8"))
+
+    def show():
         console.print_answer(Telling([first]), "29.9 s")
         console.print_ending("good", "good", "written to out/", step)
-        sys.stdout.flush()
-        lines = raw.getvalue().decode().splitlines()
+
+    lines = shown_on(Terminal, monkeypatch, show, COLUMNS="80", TERM="xterm").splitlines()
     assert lines[0] == f"{first}    29.9 s"
     assert lines[-1].strip() == f"next: {step}".strip()
 
 
-def test_options_are_spelled_as_the_command_takes_them(monkeypatch, tmp_path):
-    monkeypatch.setattr(console, "flag_names", {"min_trust", "overwrite", "rigs"})
-    monkeypatch.setattr(console, "key_names", {"min_trust", "min_inliers"})
-    assert console.in_flags("rigs=free, or min_trust=0.5; tol=1") == "--rigs free, or --min-trust 0.5; tol=1"
-    assert console.in_flags("replace it (overwrite=True)") == "replace it (--overwrite)"
-    assert console.in_flags("by min_inliers=10") == "by min_inliers = 10 in the file of --config"
+def test_options_are_spelled_as_the_command_takes_them(tmp_path):
     typed = run("locate", RING / "sparse/0", tmp_path / "out", "--min-trust", "7", code=2)
     assert "--min-trust must lie in [0, 1]" in typed.output
     (tmp_path / "few.toml").write_text("min_trust = 7\n[directions]\nmin_inlers = 3\n")
     config = tmp_path / "few.toml"
     assert "did you mean min_inliers?" in run("locate", RING / "sparse/0", "out", "--config", config).output
+    assert console.in_flags("rigs=free, or min_trust=0.5; k=1") == "--rigs free, or --min-trust 0.5; k=1"
+    assert console.in_flags("replace it (overwrite=True)") == "replace it (--overwrite)"
+    assert console.in_flags("by min_inliers=10") == "by min_inliers = 10 in the file of --config"
     config.write_text("min_trust = 7\n")
     assert " min_trust must lie in" in run("locate", RING / "sparse/0", "out", "--config", config).output
 
@@ -236,7 +230,7 @@ def test_options_are_spelled_as_the_command_takes_them(monkeypatch, tmp_path):
 def test_a_path_that_is_longer_than_the_table_is_folded_not_cut(monkeypatch):
     monkeypatch.setenv("COLUMNS", "40")
     path = "/" + "/".join(f"folder{k}" for k in range(12))
-    shown = written(monkeypatch, "utf-8", partial(console.print_table, path, [("written to", path)]))
+    shown = written(monkeypatch, partial(console.print_table, path, [("written to", path)]))
     assert "\u2026" not in shown
     assert path in "".join(shown.replace("│", " ").split()).partition("writtento")[2].replace("┘", "")
 
@@ -246,6 +240,6 @@ def test_a_run_says_how_much_of_its_time_went_into_compiling(monkeypatch):
         time.sleep(0.02)
     assert 0.02 <= spent.seconds < 1.0  # once, though one counted inside the other
     run_ = Run(options=None, flags=OutputFlags(), protect=[], compiling=spent)
-    assert "compiling" not in run_._describe_time()
+    assert "compiling" not in run_.describe_time()
     spent.seconds = 97.2
-    assert re.fullmatch(r"\d+\.\d s, of which 97 s compiling kernels, once", run_._describe_time())
+    assert re.fullmatch(r"\d+\.\d s, of which 97 s compiling kernels, once", run_.describe_time())

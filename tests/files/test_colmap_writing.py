@@ -234,19 +234,6 @@ def test_points_follow_the_new_positions_and_those_of_the_models_own_tracks_keep
     assert set(structure.point3D_ids()) == set(original.point3D_ids())
 
 
-@SOURCES
-def test_tracks_in_blocks_give_the_same_bits(source, monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.adjustment.structure._TRACKS_A_BLOCK", 7)
-    original, points = ring_model(noise_px=3.0)
-    (seed, tracks), seen = seeded_with(source, original, ring_centers() + 0.01), []
-    cut = triangulated(seed, tracks, None, lambda *done: seen.append(done))
-    assert cut.num_points3D() > 0.9 * len(points)
-    (num_tracks,) = {total for _, total in seen}
-    assert [done for done, _ in seen] == [*range(7, num_tracks, 7), num_tracks]
-    monkeypatch.undo()
-    assert dump(cut) == dump(triangulated(seed, tracks))
-
-
 def wrong_in_part(share):
     """All matches of the ring, of which a share is of wrong keypoints."""
     rng = np.random.default_rng(1)
@@ -260,10 +247,8 @@ def wrong_in_part(share):
 def test_points_of_matches_are_the_same_bits_whatever_the_blocks(monkeypatch):
     original, _ = ring_model(noise_px=0.3)
     found = []
-    for tracks, matches in ((10**9, 10**9), (7, 11), (120, 500)):
-        monkeypatch.setattr("sfm_shapefit.adjustment.structure._TRACKS_A_BLOCK", tracks)
+    for matches in (10**9, 11, 500):
         monkeypatch.setattr("sfm_shapefit.adjustment.sources._MATCHES_A_SLICE", matches)
-        monkeypatch.setattr("sfm_shapefit.tracks.links._MATCHES_A_SLICE", matches)
         found.append(dump(triangulated(*seeded(original, batches=wrong_in_part(0.3)))))
     assert found[0] == found[1] == found[2]
 

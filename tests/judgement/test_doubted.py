@@ -15,12 +15,9 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.doubted import confirm_cameras, weigh_doubts
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.turns import Doubt
-from sfm_shapefit.pairs import essential as relative_rotations
-from sfm_shapefit.pairs.essential import estimate_relative_rotations
+from sfm_shapefit.pairs.essential import concatenate_rotations
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pipeline import doubts as doubts_stage
-from sfm_shapefit.pipeline import locate as locating
-from sfm_shapefit.pipeline.doubts import ask_pairs
+from sfm_shapefit.pipeline.doubts import ask_pairs, ask_rotations, doubt_cameras
 from sfm_shapefit.pipeline.inputs import inputs_from, see_matches
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
@@ -77,20 +74,26 @@ def test_confirmed_cameras_are_trusted_and_no_reason_counts_them(photographed):
 @pytest.mark.parametrize(
     ("guessed", "subject"), [(True, "its rotation, or its guessed focal length,"), (False, "its rotation")]
 )
-def test_what_a_wrong_lens_explains_as_well_is_not_laid_to_the_rotation_alone(monkeypatch, guessed, subject):
-    monkeypatch.setattr(doubts_stage, "_is_guess", lambda _: guessed)
-    found = sfm_shapefit.locate(PHOTOGRAPHED / "sparse" / "0", adjust="none").placement.assessment
-    assert found.doubts.guessed.tolist() == 16 * [guessed]
-    for kind, said in (
-        (Doubt.TURNED, f"{subject} is wrong: 4 of its pairs agree on a turn by "),
-        (Doubt.UNSUPPORTED, f"none of its pairs agrees with it: {subject} may be wrong"),
-    ):
-        turned, placed = np.ones(16), np.full(16, 0.1)
-        doubts = replace(
-            found.doubts, kinds=(kind,) * 16, num_turned=np.full(16, 4), turned=turned, placed=placed
-        )
-        reasons = weigh_doubts(found, doubts).reasons
-        assert all(reason.startswith(said) for reason in reasons)
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        (Doubt.TURNED, "{} is wrong: 4 of its pairs agree on a turn by "),
+        (Doubt.UNSUPPORTED, "none of its pairs agrees with it: {} may be wrong"),
+    ],
+)
+def test_what_a_wrong_lens_explains_as_well_is_not_laid_to_the_rotation_alone(
+    photographed, guessed, subject, kind, said
+):
+    found = photographed.placement.assessment
+    doubts = replace(
+        found.doubts,
+        kinds=(kind,) * 16,
+        num_turned=np.full(16, 4),
+        turned=np.ones(16),
+        placed=np.full(16, 0.1),
+        guessed=np.full(16, guessed),
+    )
+    assert all(one.startswith(said.format(subject)) for one in weigh_doubts(found, doubts).reasons)
 
 
 @pytest.mark.parametrize(
@@ -103,8 +106,11 @@ def test_what_a_wrong_lens_explains_as_well_is_not_laid_to_the_rotation_alone(mo
         (Lens("SIMPLE_PINHOLE", (9.0, 2.0, 1.0)), False),
     ],
 )
-def test_a_guess_is_one_until_something_changes_it(lens, expected):
-    assert doubts_stage._is_guess(lens) == expected
+def test_a_guess_is_one_until_something_changes_it(photographed, lens, expected):
+    images = photographed.images.with_lenses([lens])
+    asked = concatenate_rotations([])
+    found = doubt_cameras(photographed.placement, photographed.directions, asked, images)
+    assert found.assessment.doubts.guessed.tolist() == 16 * [expected]
 
 
 def test_every_camera_of_a_clean_scene_is_trusted(courtyard_located):
@@ -131,67 +137,44 @@ def test_turned_cameras_are_put_right_or_left_out_and_no_others(chosen, angle_de
     assert {row.name for row in unadjusted.cameras if not row.placed} == wrong
 
 
-def test_a_large_set_is_judged_as_well_by_six_pairs_of_each_camera(monkeypatch):
-    """As a model of 5,000 images is: 25 images may ask 150 pairs, so each one only its six strongest."""
-    asked = []
-
-    def estimate(rays, threads, **known):
-        asked.extend(rays.pairs.tolist())
-        return estimate_relative_rotations(rays, threads, **known)
-
-    monkeypatch.setattr(doubts_stage, "_MOST_ASKED", 6 * 25)
-    monkeypatch.setattr(doubts_stage, "estimate_relative_rotations", estimate)
-    model, wrong = turned(COURTYARD, (9, 10, 11, 12, 13), 2.0)
-    found = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust="none")
-    assert 0 < len(asked) <= 6 * 25
-    assert {row.name for row in found.cameras if not row.placed} == wrong
-    kinds = dict(zip(found.images.names, found.placement.assessment.doubts.kinds, strict=True))
-    assert {name for name, kind in kinds.items() if kind is not Doubt.RIGHT} == wrong
-
-
-def test_of_very_many_pairs_only_those_of_turned_cameras_need_trials(monkeypatch):
-    tried, trials = [], relative_rotations._start_by_trials
-
-    def trying(matches, are_many):
-        tried.extend(matches.pairs.tolist())
-        return trials(matches, are_many)
-
-    monkeypatch.setattr(locating, "tell_convention", lambda found, *_: found)  # which asks 200 at most
-    monkeypatch.setattr(doubts_stage, "have_many_pairs", lambda *_: True)
-    monkeypatch.setattr(relative_rotations, "_start_by_trials", trying)
-    model, wrong = turned(COURTYARD, (9, 10, 11, 12, 13), 2.0)
-    found = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust="none")
-    assert {row.name for row in found.cameras if not row.placed} == wrong
-    touching = [any(found.images.names[k] in wrong for k in pair) for pair in tried]
-    assert np.mean(touching) > 0.9
-
-
-def test_what_pairs_said_alone_is_the_answer_again_without_trials(monkeypatch):
-    tried, trials = [], relative_rotations._start_by_trials
-
-    def trying(matches, are_many):
-        tried.extend(matches.pairs.tolist())
-        return trials(matches, are_many)
-
+@pytest.fixture(scope="module")
+def asked():
+    """The courtyard with a camera that is turned, its matches, and the directions that these give."""
     model, _ = turned(COURTYARD, (7,), 5.0)
     images = read_model(model).images
     with closing(open_database(COURTYARD / "database.db", images.names)) as matches:
         source = see_matches(matches, images, inputs_from(COURTYARD / "database.db"))
-        directions = measure(source, DirectionOptions(), Clock()).directions
-        alone = measure_rotations(matches.at(images.apart()))
-        anew = ask_pairs(source, directions, 1)
-        monkeypatch.setattr(relative_rotations, "_start_by_trials", trying)
-        again = ask_pairs(replace(source, alone=alone), directions, 1)
-        assert len(tried) < 0.1 * len(again.pairs)
-        np.testing.assert_array_equal(again.pairs, anew.pairs)
-        apart = rotation_angles_deg(again.rotations.transpose(0, 2, 1) @ anew.rotations)
-        assert np.quantile(apart, 0.9) < 1e-3  # the same optimum, but of a few pairs that have two
-        # Of pairs that said nothing before, and of those that fit much worse now, the trials decide.
-        tried.clear()
-        better = replace(alone, weight_shares=2.0 * alone.weight_shares).subset(alone.pairs[:, 0] < 5)
-        found = ask_pairs(replace(source, alone=better), directions, 1)
-        np.testing.assert_array_equal(found.rotations, anew.rotations)
-        assert len(tried) == len(anew.pairs)
+        yield source, measure(source, DirectionOptions(), Clock()).directions
+
+
+def angles_deg(one, other):
+    return rotation_angles_deg(one.rotations.transpose(0, 2, 1) @ other.rotations)
+
+
+def test_pairs_that_are_first_tried_as_given_say_the_same_of_a_turned_camera(asked):
+    source, directions = asked
+    anew = ask_rotations(source, directions.pairs, 1)
+    as_given = ask_rotations(source, directions.pairs, 1, directions)  # as those of very many pairs are
+    np.testing.assert_array_equal(as_given.pairs, anew.pairs)
+    touching = (anew.pairs == 7).any(axis=1) & anew.are_sound()
+    assert touching.sum() > 5
+    assert angles_deg(as_given, anew)[touching].max() < 1e-3
+    assert np.quantile(angles_deg(as_given, anew), 0.8) < 1e-3
+
+
+def test_what_pairs_said_alone_is_the_answer_again_without_trials(asked):
+    source, directions = asked
+    alone = measure_rotations(source.view.matches.at(source.images.apart()))
+    anew = ask_pairs(source, directions, 1)
+    again = ask_pairs(replace(source, alone=alone), directions, 1)
+    np.testing.assert_array_equal(again.pairs, anew.pairs)
+    assert np.quantile(angles_deg(again, anew), 0.9) < 1e-3  # the same optimum, but of a few pairs of two
+    by_trials = (again.rotations == anew.rotations).all(axis=(1, 2))  # from elsewhere the last digits differ
+    assert by_trials.mean() < 0.1
+    # Of pairs that said nothing before, and of those that fit much worse now, the trials decide.
+    better = replace(alone, weight_shares=2.0 * alone.weight_shares).subset(alone.pairs[:, 0] < 5)
+    found = ask_pairs(replace(source, alone=better), directions, 1)
+    np.testing.assert_array_equal(found.rotations, anew.rotations)
 
 
 def test_a_camera_that_is_turned_a_little_is_put_right():

@@ -89,6 +89,14 @@ def test_a_camera_that_the_other_model_doubts_is_not_confirmed_by_it(images):
     assert sorted([*found.confirmed.tolist(), 5, 7]) == list(range(N))
 
 
+@pytest.mark.parametrize(("wrong", "apart"), [([5], False), ([5, 6], True)])
+def test_a_single_camera_elsewhere_is_no_group_that_stands_apart(images, wrong, apart):
+    second = compare(moved(images, wrong, shift=2.0), images, images)
+    assert second.wrong.tolist() == wrong
+    said = [one.sentence for one in weigh_evidence(ModelEvidence(second=second), images)]
+    assert any("stand apart from the rest" in sentence for sentence in said) == apart
+
+
 def test_what_it_clears_is_not_told(images):
     """Of groups on both sides of a seam the wrong one is; who stands alike in both has one place."""
     place = OtherPlace(5, 2, 3, np.ones(3), np.zeros((2, 2), dtype=int))

@@ -1,27 +1,35 @@
 """What of the observations agrees with the cameras, what contradicts them, and what merely sees no point."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import sfm_shapefit
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.adjustment.sources import collect_matches
 from sfm_shapefit.adjustment.views import views_of
+from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import ModelPictures, points_of
-from sfm_shapefit.judgement.reasons import Grade
+from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.judgement.support import (
     ObservationCounts,
     PartnerCounts,
     images_of_few_points,
     images_without_support,
 )
-from sfm_shapefit.pipeline import seed
+from sfm_shapefit.pipeline.finish import finish_model
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
+from sfm_shapefit.pipeline.seed import seed_points
+from sfm_shapefit.pipeline.stages import set_gauge
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.matches import is_among
-from tests.models import arrays
+from tests.models import arrays, posed
+from tests.pipeline.made import FOLDER, opened, state_at
+from tests.problems import turn
 from tests.scenes import RING
 
 NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
@@ -45,7 +53,7 @@ def counted_at(images, points, apart=NO_PAIRS):
     return counted.compare(points)
 
 
-def judge(images, points, apart=NO_PAIRS):
+def shares_at(images, points, apart=NO_PAIRS):
     return counted_at(images, points, apart).shares(images.is_posed)
 
 
@@ -56,40 +64,37 @@ def arrays_of(found):
 
 
 def test_observations_of_right_cameras_agree(found):
-    shares = judge(*arrays_of(found))
+    shares = shares_at(*arrays_of(found))
     assert shares == found.observations
     assert shares.agreeing > 0.9
     assert shares.contradicting < 0.01
-    assert judge(*arrays_of(found), apart=np.array([[1, 0], [2, 3]])) == shares
+    assert shares_at(*arrays_of(found), apart=np.array([[1, 0], [2, 3]])) == shares
 
 
-def test_partners_that_leave_are_not_counted(found, monkeypatch):
-    def leave(points, *_):
-        return np.where(np.arange(8) == 3, points.count_seen(8), -1)
+def judged_at(source, **options):
+    """The ring at its true places, all of it kept, before it has points."""
+    state = state_at(source, 0.1 * source.images.centers, options=LocateOptions(**options))
+    return replace(state, placement=judge(state.placement, PlacementOptions()), kept=np.ones(8, dtype=bool))
 
-    monkeypatch.setattr(seed, "images_of_few_points", leave)
-    told = []
-    monkeypatch.setattr(
-        seed, "images_without_support", lambda counts, *_: told.append(counts) or np.zeros(8, bool)
-    )
-    fewer = sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db")
-    assert fewer.reconstruction.num_reg_images() == 7
-    expected = counted_at(*arrays_of(fewer))
-    np.testing.assert_array_equal(told[-1].checked, expected.checked)
-    np.testing.assert_array_equal(told[-1].agreeing, expected.agreeing)
-    assert expected.checked.sum() < counted_at(*arrays_of(found)).checked.sum()
+
+def test_partners_that_leave_are_not_counted():
+    with opened() as source:
+        seen = seed_points(judged_at(source), Clock()).points.count_seen(8)
+        fewer = seed_points(judged_at(source, min_points_per_image=int(seen.min()) + 1), Clock())
+    assert np.flatnonzero(~fewer.images.is_posed).tolist() == [seen.argmin()]
+    assert fewer.support.observations == counted_at(fewer.images, fewer.points).shares(fewer.images.is_posed)
 
 
 def test_observations_without_a_point_contradict_only_cameras_that_are_wrong(found):
     images, points = arrays_of(found)
     none = points.taken(np.zeros(len(points.images), dtype=bool))
-    bare = judge(images, none)
+    bare = shares_at(images, none)
     assert bare.agreeing == 0.0
     assert bare.contradicting < 0.05
 
     frames = images.frames
     turns = Rotation.from_rotvec([[0.0, 0.0, 0.1 * (k % 3)] for k in frames.ids.tolist()]).as_matrix()
-    assert judge(images.posed(turns @ frames.rotations, frames.centers), none).contradicting > 0.5
+    assert shares_at(images.posed(turns @ frames.rotations, frames.centers), none).contradicting > 0.5
 
 
 def counts_of(checked, agreeing):
@@ -126,26 +131,17 @@ def test_images_of_few_points_take_theirs_along_and_three_frames_stay(found):
     assert not without.count_seen(8)[gone >= 0].any()
 
 
-def test_it_is_named_and_can_be_kept(monkeypatch):
-    class Misled(PartnerCounts):
-        def compare(self, points):
-            counts = super().compare(points)
-            counts.agreeing[2] = 0
-            return counts
-
-    monkeypatch.setattr(seed, "PartnerCounts", Misled)
-    found = sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db")
-    name = found.images.names[2]
-    row = next(row for row in found.cameras if row.name == name)
-    assert not row.placed
-    assert "hardly any of its matches makes a point" in row.reason
-    assert found.verdict.grade is Grade.LOOK
+@pytest.mark.parametrize("min_trust", [0.5, 0.0])
+def test_it_is_named_and_can_be_kept(min_trust):
+    """A camera that is turned by five degrees, and trusted all the same."""
+    truth = read_model(FOLDER).images
+    name = truth.names[2]
+    model = posed(FOLDER, lambda one, r, c: (turn([0.0, 1.0, 0.0], 5.0 * (one == name)) @ r, c))
+    with opened(model) as source:
+        state = replace(judged_at(source, min_trust=min_trust), evidence=ModelEvidence())
+        found = finish_model(set_gauge(seed_points(state, Clock())), Clock())
+    assert found.seed.images.is_posed[2] == (min_trust == 0.0)
+    assert "hardly any of its matches makes a point" in found.cameras[2].reason
     assert name in found.verdict.cameras
-    assert any(name in warning and "min_trust=0" in warning for warning in found.warnings)
-    assert name in found.summary()["few_points"]
-
-    kept = sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db", min_trust=0.0)
-    assert all(row.placed for row in kept.cameras)
-    assert [row.name for row in kept.cameras if row.reason] == [name]
-    assert name in kept.verdict.cameras
-    assert any(name in warning and "kept, as min_trust=0 asks" in warning for warning in kept.warnings)
+    said = "kept, as min_trust=0 asks" if min_trust == 0.0 else "min_trust=0"
+    assert any(name in warning and said in warning for warning in found.warnings)

@@ -15,7 +15,7 @@ from harness.graphs import laplacian_matrix
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.laplacian import ordering, symbolic
+from sfm_shapefit.laplacian import ordering
 from sfm_shapefit.laplacian.approximate import JacobiPreconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.factor import allocate_factor, analyze, factorize
 from sfm_shapefit.laplacian.operators import LaplacianOperator, Workers, adjacency
@@ -103,7 +103,7 @@ def true_counts(n: int, edges: npt.NDArray[np.int64], order: npt.NDArray[np.int6
     return counts
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 40), density=st.floats(0.0, 0.4))
 def test_predicted_fill_is_that_of_the_elimination_game(seed, n, density):
     rng = np.random.default_rng(seed)
@@ -118,7 +118,7 @@ def test_predicted_fill_is_that_of_the_elimination_game(seed, n, density):
     assert tree.flops == sum(c * c for c in counts)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(2, 60),
@@ -357,17 +357,17 @@ def test_the_automatic_order_is_the_one_of_least_work():
     assert tried[0] != tried[1]
 
 
-@pytest.mark.parametrize(("name", "asked"), [("seq", True), ("comm", False)])
-def test_beside_metis_minimum_degree_is_tried_only_where_it_can_win(name, asked, monkeypatch):
+@pytest.mark.parametrize("name", FAMILIES)
+def test_the_order_of_elimination_is_the_better_of_metis_and_minimum_degree_where_either_helps(name):
     n, edges, _ = family(name)
-    graph, calls = adjacency(n, edges), []
-    monkeypatch.setattr(
-        ordering, "minimum_degree_order", lambda g: calls.append(g) or np.arange(g.num_nodes)[::-1]
+    graph = adjacency(n, edges)
+    metis, by_degree = (
+        elimination_tree(graph, order(graph)).flops
+        for order in (ordering.metis_order, ordering.minimum_degree_order)
     )
-    metis = elimination_tree(graph, ordering.metis_order(graph)).flops
-    assert (metis < ordering._BAND_FLOPS * len(edges)) == asked
-    ordering.best_order(graph)
-    assert bool(calls) == asked
+    best = ordering.best_order(graph).flops
+    assert best <= metis
+    assert best <= by_degree or name != "seq"  # on bands it can win
 
 
 def test_dissection_halves_a_grid_and_orders_a_graph_with_repeated_edges_as_well():
@@ -495,10 +495,3 @@ def test_blas_threads_are_restored_after_nested_limits():
     with one_blas_thread(), one_blas_thread():
         assert set(threads()) == {1}
     assert threads() == before
-
-
-def test_a_small_plan_runs_what_cuts_large_ones_into_tasks(monkeypatch):
-    ran, subtrees = [], symbolic._subtrees
-    monkeypatch.setattr(symbolic, "_subtrees", lambda *given: ran.append(given) or subtrees(*given))
-    analyze(4, np.array([[0, 1], [1, 2], [2, 3]]))
-    assert ran  # so that warm-up compiles it, whose examples are small

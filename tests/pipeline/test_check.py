@@ -1,6 +1,5 @@
 """`check MODEL`: the verdict on any COLMAP model as it stands, which is left as it is."""
 
-import importlib
 import json
 from dataclasses import replace
 
@@ -64,11 +63,11 @@ def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path, ring_ma
     )  # its model has that camera right
 
 
-def test_a_page_that_would_replace_another_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
+def test_a_page_that_would_replace_another_is_refused_before_anything_is_read(tmp_path):
     (tmp_path / "page.html").touch()
-    monkeypatch.setattr(importlib.import_module("sfm_shapefit.pipeline.check"), "check", None)
-    page = ("--report", tmp_path / "page.html")
-    assert "exists already" in run_refused("check", RING / "sparse" / "0", *page)
+    (tmp_path / "database.db").write_text("no database")
+    told = ("--report", tmp_path / "page.html", "--database", tmp_path / "database.db")
+    assert "exists already" in run_refused("check", RING / "sparse" / "0", *told)
 
 
 def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
@@ -124,6 +123,16 @@ def test_what_map_doubts_check_does_not_call_good():
         evidence = found.facts.evidence
         unlike = replace(evidence, second=replace(evidence.second, has_nothing_in_common=True))
         assert " workspace " not in replace(found.facts, evidence=unlike).next_step.command
+
+
+def test_a_weak_camera_that_stands_where_another_model_has_it_is_not_named(tmp_path):
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    for point_id in sorted(model.point3D_ids())[25:]:  # no image sees 30
+        model.delete_point3D(point_id)
+    model.write(tmp_path)
+    for second_opinion, num_named in ((False, 8), (True, 0)):
+        found = check(tmp_path, RING / "database.db", second_opinion=second_opinion)
+        assert len(found.verdict.cameras) == num_named
 
 
 def test_a_camera_that_has_two_places_in_the_other_model_is_not_confirmed(courtyard_mapped):

@@ -15,8 +15,10 @@ from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline import examination as evidence
 from sfm_shapefit.pipeline.check import check
+from sfm_shapefit.pipeline.examination import Structure, images_to_ask, lost_points
 from sfm_shapefit.pipeline.inputs import inputs_from, open_source
 from sfm_shapefit.pipeline.referee import check_source
+from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
 from tests.models import by_name, write_priors
@@ -61,16 +63,20 @@ def test_a_wrong_lens_that_is_held_is_named_with_the_right_focal_length():
     assert found.summary()["evidence"]["lenses"][0]["camera"] == wrong_id
 
 
-def test_of_a_lens_that_took_many_images_only_some_are_asked(monkeypatch):
-    images = read_model(COURTYARD / "truth").images
-    n, own = images.num_images, np.arange(images.num_images) % 2 == 0
-    assert evidence._ask_some(images, None) is None
-    assert evidence._ask_some(images, own) is own
-    monkeypatch.setattr(evidence, "_MOST_ASKED", 4)
-    assert np.flatnonzero(evidence._ask_some(images, None)).tolist() == list(range(0, n, -(-n // 4)))
-    asked = evidence._ask_some(images, own)
-    assert 2 <= asked.sum() <= 4
-    assert not asked[~own].any()
+@pytest.mark.parametrize(
+    ("num_posed", "asked", "expected"),
+    [
+        (450, None, range(0, 450, 3)),  # at most 200
+        (450, range(0, 450, 2), range(0, 450, 4)),
+        (150, None, None),
+        (150, range(0, 150, 2), range(0, 150, 2)),
+    ],
+)
+def test_of_a_lens_that_took_many_images_only_some_are_asked(num_posed, asked, expected):
+    lens, every = Lens("SIMPLE_PINHOLE", (100.0, 0.0, 0.0)), np.arange(450)
+    images = SimpleNamespace(lenses=(lens,), lens_of=np.zeros(450, dtype=int), is_posed=every < num_posed)
+    found = images_to_ask(images, asked if asked is None else np.isin(every, asked))
+    assert (found if found is None else np.flatnonzero(found).tolist()) == (expected and [*expected])
 
 
 def spoiled(amount_deg=0.0, shift=0.0):
@@ -138,53 +144,83 @@ def test_halves_that_two_pairs_tie_are_doubted_where_what_tied_them_was_rejected
     assert right.verdict.grade is Grade.GOOD
 
 
-@pytest.mark.parametrize(("same", "apart", "is_lost"), [(20, 10, False), (20, 11, True), (20, 0, False)])
+class Row:
+    """Cameras of 100 px, 1 apart in a row: two groups of two, and points that they see.
+
+    The groups share the matches of the images in the middle, 1 and 2. `same` of them see one point; of
+    `apart` others either group has a point, that of the second group `off_px` from that of the first in
+    images 1 and 2.
+    """
+
+    def __init__(self, same, apart, off_px):
+        rng, n = np.random.default_rng(0), same + apart
+        first = np.column_stack([rng.uniform(-1.0, 4.0, n), rng.uniform(-2.0, 2.0, n), np.full(n, 10.0)])
+        depth = 100.0 / (10.0 + off_px[0] - off_px[1])
+        second = first[same:] * [1.0, depth / 10.0, depth / 10.0]
+        second[:, 0] = 1.0 + depth * (10.0 * (first[same:, 0] - 1.0) + off_px[0]) / 100.0
+        centers = np.arange(4.0)[:, None] * [1.0, 0.0, 0.0]
+        own = np.arange(same, n)
+        seen = [(0, 1, 2)] * same + [(0, 1)] * apart + [(2, 3)] * apart
+        self.points = Points(
+            xyz=np.concatenate([first, second]),
+            offsets=np.cumsum([0, *map(len, seen)]),
+            images=np.concatenate(seen),
+            keypoints=np.repeat([*range(n), *own], [len(one) for one in seen]),
+            ids=np.arange(len(seen)),
+        )
+        pixels = [100.0 * ((x - c)[:, :2] / x[:, 2:]) for c, x in zip(centers, [first] * 4, strict=True)]
+        for k in (2, 3):
+            pixels[k][same:] = 100.0 * (second - centers[k])[:, :2] / second[:, 2:]
+        lens = Lens("SIMPLE_PINHOLE", (100.0, 0.0, 0.0))
+        self.images = SimpleNamespace(
+            num_images=4,
+            is_posed=np.ones(4, dtype=bool),
+            rotations=np.tile(np.eye(3), (4, 1, 1)),
+            centers=centers,
+            lenses=(lens,),
+            lens_of=np.zeros(4, dtype=int),
+        )
+        self.pictures = SimpleNamespace(
+            count=lambda _: n,
+            pixels=lambda k, keypoints: pixels[k][keypoints],
+            project=lambda _k, x, **_: 100.0 * x[:, :2] / x[:, 2:],
+        )
+        self.num_keypoints, self.is_same = np.full(4, n), np.arange(len(seen)) < same
+        own = np.tile(np.arange(n)[:, None], 2)
+        self.matches = KeypointMatches(pairs=np.array([[1, 2]]), offsets=np.array([0, n]), keypoints=own)
+
+    def lost(self, group=(0, 0, 1, 1), pictures=None, also=()):
+        view = SimpleNamespace(
+            pairs=np.array([[0, 1], [1, 2]]),
+            num_keypoints=self.num_keypoints,
+            links=lambda **_: [self.matches, *also],
+        )
+        structure = Structure(self.points, self.images, pictures or self.pictures)
+        fits = np.ones(len(self.points.images), dtype=bool)
+        return lost_points(view, structure, fits, np.array(group))
+
+
+@pytest.mark.parametrize(
+    ("same", "apart", "off_px", "is_lost"),
+    [
+        (20, 10, (0.0, 5.0), False),
+        (20, 11, (0.0, 5.0), True),
+        (20, 11, (5.0, 5.0), True),
+        (20, 11, (0.0, 3.0), False),  # two points, but at the same place
+        (20, 11, (5.0, 3.0), True),
+        (20, 0, (0.0, 5.0), False),
+    ],
+)
 def test_points_are_lost_that_only_a_pair_carries_whose_matches_mostly_see_two_points(
-    monkeypatch, same, apart, is_lost
+    same, apart, off_px, is_lost
 ):
-    """Two groups of two images; images 1 and 2 share points, and match some of their own."""
-    total = same + 2 * apart
-    seen = [(0, 1, 2)] * same + [(0, 1)] * apart + [(2, 3)] * apart
-    keypoint = np.array([*range(same + apart), *range(same, same + apart)])
-    points = Points(
-        xyz=np.zeros((total, 3)),
-        offsets=np.cumsum([0, *map(len, seen)]),
-        images=np.concatenate(seen),
-        keypoints=np.repeat(keypoint, [len(one) for one in seen]),
-        ids=np.arange(total),
-    )
-    own = np.tile(np.arange(same + apart)[:, None], 2)
-    matches = KeypointMatches(pairs=np.array([[1, 2]]), offsets=np.array([0, same + apart]), keypoints=own)
-    view = SimpleNamespace(
-        pairs=np.array([[0, 1], [1, 2]]),
-        num_keypoints=np.full(4, same + apart),
-        links=lambda **_: [matches],
-    )
-    images = SimpleNamespace(is_posed=np.ones(4, dtype=bool), num_images=4)
-    pictures = SimpleNamespace(count=lambda _: same + apart)
-    structure = evidence.Structure(points, images, pictures)
-    errors_px = {
-        1: 0.0,
-        2: 5.0,
-    }  # of points of the second group seen by the first, and of the first by the second
-    monkeypatch.setattr(
-        evidence,
-        "keypoint_errors_px",
-        lambda seen, *_: np.array([errors_px[k] for k in seen.images.tolist()]),
-    )
-    fits, group = np.ones(len(points.images), dtype=bool), np.array([0, 0, 1, 1])
-    lost = evidence._are_lost(view, structure, fits, group)
-    assert lost.tolist() == [is_lost] * same + [False] * 2 * apart
-    assert not evidence._are_lost(view, structure, fits, np.zeros(4, dtype=int)).any()
-    other = structure._replace(pictures=SimpleNamespace(count=lambda _: 1))  # keypoints of another file
-    assert not evidence._are_lost(view, other, fits, group).any()
-    errors_px[2] = 3.0  # two points, but at the same place
-    assert not evidence._are_lost(view, structure, fits, group).any()
-    errors_px[1] = 5.0
-    assert evidence._are_lost(view, structure, fits, group).any() == is_lost
-    again = replace(matches, keypoints=own[:same], offsets=np.array([0, same]))
-    view.links = lambda **_: [matches, again]  # a pair all of whose matches see the same
-    assert not evidence._are_lost(view, structure, fits, group).any()
+    row = Row(same, apart, off_px)
+    np.testing.assert_array_equal(row.lost(), row.is_same & is_lost)
+    assert not row.lost(group=(0, 0, 0, 0)).any()
+    others = SimpleNamespace(**vars(row.pictures) | {"count": lambda _: 1})  # keypoints of another file
+    assert not row.lost(pictures=others).any()
+    sound = replace(row.matches, keypoints=row.matches.keypoints[:same], offsets=np.array([0, same]))
+    assert not row.lost(also=[sound]).any()  # a pair all of whose matches see the same
 
 
 def test_halves_that_a_join_ties_are_not_doubted(halves):

@@ -17,9 +17,9 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import concatenate
-from sfm_shapefit.pipeline import execution
 from sfm_shapefit.pipeline.execution import (
     WorkerError,
+    interrupts_wait,
     measure_part,
     measure_with_workers,
     open_executor,
@@ -43,11 +43,11 @@ def serial(tiny_ring, model):
     return found
 
 
-def shared(tiny_ring, model, executor):
+def shared(tiny_ring, model, executor, estimate=ESTIMATE):
     seen = []
     with view_of(tiny_ring / "database.db", model.images) as view:
         clock = Clock(lambda _stage, *done: seen.append(done), executor=executor)
-        parts = measure_with_workers(view, ESTIMATE, clock, matches_per_task=700)
+        parts = measure_with_workers(view, estimate, clock, matches_per_task=700)
     return concatenate(parts), seen
 
 
@@ -72,41 +72,38 @@ def _die(*_given):
 
 
 @pytest.mark.slow
-def test_a_worker_that_dies_in_a_pool_is_reported(tiny_ring, model, monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_part", _die)
+def test_a_worker_that_dies_in_a_pool_is_reported(tiny_ring, model):
     with (
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
         pytest.raises(WorkerError, match=r"a worker failed .* run again"),
     ):
-        shared(tiny_ring, model, pool)
+        shared(tiny_ring, model, pool, _die)
 
 
-def test_an_error_of_the_input_passes_as_it_is(tiny_ring, model, monkeypatch):
+def test_an_error_of_the_input_passes_as_it_is(tiny_ring, model):
     def refuse(*_given):
         raise InputError("the database is damaged")
 
-    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_part", refuse)
     with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="the database is damaged"):
-        shared(tiny_ring, model, pool)
+        shared(tiny_ring, model, pool, refuse)
 
 
-def die_once(flag, *given):
+def die_once(flag, batch):
     """Kill the first worker that comes here, in the middle of the work."""
     try:
         os.close(os.open(flag, os.O_CREAT | os.O_EXCL))
     except FileExistsError:
         time.sleep(0.05)
-        return measure_part(*given)
+        return ESTIMATE(batch)
     os._exit(1)
 
 
 @pytest.mark.slow
-def test_dask_gives_the_work_of_a_killed_worker_to_another(tiny_ring, model, monkeypatch, tmp_path):
+def test_dask_gives_the_work_of_a_killed_worker_to_another(tiny_ring, model, tmp_path):
     pytest.importorskip("distributed")
     flag = tmp_path / "killed"
-    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_part", partial(die_once, str(flag)))
     with open_executor("dask", 2) as pool:
-        found, _ = shared(tiny_ring, model, pool)
+        found, _ = shared(tiny_ring, model, pool, partial(die_once, str(flag)))
     assert flag.exists()
     assert_same_bits(found, serial(tiny_ring, model))
 
@@ -136,7 +133,7 @@ def test_an_interrupt_while_a_cluster_opens_comes_when_it_can_be_closed():
     done, before = [], signal.getsignal(signal.SIGINT)
 
     def open_cluster():
-        with execution._interrupts_wait():
+        with interrupts_wait():
             signal.raise_signal(signal.SIGINT)
             done.append(1)
 
@@ -147,14 +144,15 @@ def test_an_interrupt_while_a_cluster_opens_comes_when_it_can_be_closed():
 
 
 @pytest.mark.slow
-def test_a_second_cluster_on_a_machine_opens_without_a_word_and_each_is_found_by_its_address(recwarn):
-    pytest.importorskip("distributed")
-    with open_executor("dask", 1) as first, open_executor("dask", 1) as second:
-        assert [pool.submit(abs, -2).result() for pool in (first, second)] == [2, 2]
-        address = second._client.scheduler_info()["address"]
-        with open_executor(f"dask:{address}", 1) as found:
-            assert found.submit(abs, -2).result() == 2
-            assert found._client.scheduler_info()["id"] == second._client.scheduler_info()["id"]
+def test_a_second_cluster_on_a_machine_opens_without_a_word_and_one_is_found_by_its_address(recwarn):
+    distributed = pytest.importorskip("distributed")
+    with (
+        open_executor("dask", 1) as first,
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0") as other,
+        open_executor(f"dask:{other.scheduler_address}", 1) as found,
+    ):
+        assert [pool.submit(abs, -2).result() for pool in (first, found)] == [2, 2]
+        assert found.submit(os.getpid).result() in {worker.pid for worker in other.workers.values()}
     assert [str(warning.message) for warning in recwarn if "Port" in str(warning.message)] == []
 
 

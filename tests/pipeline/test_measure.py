@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfm_shapefit.pipeline.measure import MeasureRequest, _SideResults
+from sfm_shapefit.pipeline.measure import MeasureRequest, SideResults
 from sfm_shapefit.scene.matches import KeypointMatches
 
 FOUR = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
@@ -25,11 +25,10 @@ FOUR = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 def test_a_track_of_k_keypoints_gives_two_k_less_three_facts(wanted, lone, usable, expected):
     view = SimpleNamespace(num_pairs=6, num_keypoints=np.full(4, 2), num_matches=6 + lone)
     source = SimpleNamespace(view=view, images=SimpleNamespace(num_images=4))
-    beside = _SideResults(source, 2.0, MeasureRequest(facts=wanted))
+    beside = SideResults(source, 2.0, MeasureRequest(facts=wanted), 1)
     keypoints = np.array([*[(0, 0)] * 6, *[(1, 1)] * lone])
     offsets = np.array([*range(6), len(keypoints)])  # the last pair has the further match
     batch = KeypointMatches(pairs=np.array(FOUR), offsets=offsets, keypoints=keypoints)
     beside.add(batch, SimpleNamespace(usable=lambda: np.arange(usable)))
     if wanted:
         assert beside.facts_per_match() == pytest.approx(expected, rel=1e-12)
-    assert beside._num_pairs_of.any() == (wanted and usable > 0)

@@ -12,7 +12,6 @@ from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.measure import add_evidence
 from sfm_shapefit.pipeline.memory import (
     Workload,
     choose_memory_plan,
@@ -186,14 +185,7 @@ def test_locate_keeps_a_limit_or_names_the_one_that_can_be_kept_and_a_large_one_
 
 
 @pytest.mark.parametrize("kind", ["plain", "rigs"])
-def test_what_is_given_up_is_what_the_warning_says(workspaces, kind, monkeypatch):
-    sampled = []
-
-    def listen(graph, measured):
-        sampled.append(measured.errors)
-        return add_evidence(graph, measured)
-
-    monkeypatch.setattr("sfm_shapefit.pipeline.placing.add_evidence", listen)
+def test_what_is_given_up_is_what_the_warning_says(workspaces, kind):
     full = sfm_shapefit.inspect(workspaces[kind]).expected
     for limit in range(int(full.peak_mb) - 1, 200, -5):
         try:
@@ -203,7 +195,6 @@ def test_what_is_given_up_is_what_the_warning_says(workspaces, kind, monkeypatch
         statement = next(
             text for text in found.warnings if text.startswith(f"to stay below max_memory_mb={limit}, ")
         )
-        assert ("count as independent" in statement) == (sampled[-1] is None)
         assert found.placement.measured.evidence.errors is None  # the largest arrays are not kept
         assert ("not adjusted" in statement) == (found.adjustment is None)
         assert ("neither refined" in statement) == (not found.placement.refined.is_refined)

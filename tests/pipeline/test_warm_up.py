@@ -1,18 +1,16 @@
 """`warm-up`: everything is compiled beforehand, by several processes, and nothing afterwards."""
 
 import inspect as python_inspect
-import os
 import re
-from multiprocessing import Pipe
 
 import pytest
+from numba.core import config
 
 from sfm_shapefit.base import kernel_cache
-from sfm_shapefit.laplacian import cholesky, operators, ordering
+from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.pipeline import examples
 from sfm_shapefit.pipeline import warm_up as module
-from sfm_shapefit.pipeline.warm_up import FURTHER, NEEDED, WarmUp, compile_together, warm_up
-from sfm_shapefit.solver.splitting.anderson import Anderson
+from sfm_shapefit.pipeline.warm_up import FURTHER, NEEDED, WarmUp, compile_together, not_done, warm_up
 from tests.program import run, run_python
 
 
@@ -25,21 +23,25 @@ def test_every_example_is_run():
     assert sorted(defined) == sorted(NEEDED + FURTHER)
 
 
-def test_examples_call_the_kernels_of_large_and_of_exact_graphs(tmp_path, monkeypatch):
-    called = set()
+HEAR = """
+import sys, tempfile
+from pathlib import Path
+from sfm_shapefit.base.kernel_cache import hear_of_kernels
+from sfm_shapefit.pipeline import examples
+heard = set()
+with hear_of_kernels(heard.add), tempfile.TemporaryDirectory() as folder:
+    for name in ("solve_sparse", "solve_by_splitting", "solve_iteratively"):
+        getattr(examples, name)(Path(folder))
+print(*heard)
+"""
 
-    def hear(owner, name):
-        function = getattr(owner, name)
-        monkeypatch.setattr(owner, name, lambda *given: called.add(name) or function(*given))
 
-    hear(cholesky, "gemm")
-    hear(Anderson, "advance")
-    hear(operators, "_apply_entries")
-    hear(ordering, "_distances")
-    examples.solve_sparse(tmp_path)
-    examples.solve_by_splitting(tmp_path)
-    examples.solve_iteratively(tmp_path)
-    assert called == {"gemm", "advance", "_apply_entries", "_distances"}
+def test_examples_call_the_kernels_of_large_and_of_exact_graphs():
+    done = run_python("-c", HEAR)
+    heard = set(done.stdout.split())
+    assert heard >= {"operators._apply_entries", "ordering._distances", "dense.gemm", "anderson._combine"}, (
+        done.stderr
+    )
 
 
 def test_an_example_tells_of_its_kernels_and_one_that_fails_says_why():
@@ -50,93 +52,74 @@ def test_an_example_tells_of_its_kernels_and_one_that_fails_says_why():
     assert sentence.startswith("no_such_example: AttributeError: ")
     ready, totals = zip(*told, strict=True)
     assert list(ready) == sorted(ready)
-    assert 3 <= ready[-1] < totals[0] == len(module._kernels(only_needed=False))
+    assert 3 <= ready[-1] < totals[0]
+    assert 100 < totals[0] < 1000
     assert kernel_cache.is_noted("find_pieces", kernel_cache.PACKAGE / "pipeline")
     assert not kernel_cache.is_noted("no_such_example", kernel_cache.PACKAGE / "pipeline")
 
 
-def test_processes_that_die_are_told_of(monkeypatch):
-    monkeypatch.setattr(module, "num_cores", lambda: 2)
-    monkeypatch.setattr(module, "_work", os.abort)  # which takes no argument, so that they end at once
-    done = warm_up(["find_pieces", "place_graph"])
-    assert done == WarmUp(0, ("find_pieces, place_graph: no process is left to run it",))
+KILLED = """
+import multiprocessing, os
+from pathlib import Path
+from sfm_shapefit.pipeline.warm_up import warm_up
+scratch = Path(os.environ["TMPDIR"])
+def kill(_ready, _total):
+    print(len(list(scratch.glob("*/find_pieces"))))
+    for child in multiprocessing.active_children():
+        child.kill()
+if __name__ == "__main__":
+    print(*warm_up(["find_pieces"], kill).failures, sep="|")
+    print(len(list(scratch.iterdir())))
+"""
 
 
-def test_what_a_process_that_is_killed_at_work_leaves_goes(tmp_path, monkeypatch):
-    monkeypatch.setattr(module.tempfile, "tempdir", str(tmp_path))
-    heard = module._run(["find_pieces"], 1)
-    next(heard)
-    assert list(tmp_path.glob("*/find_pieces"))
-    heard.close()
-    assert not list(tmp_path.iterdir())
+def test_processes_that_die_are_told_of_and_what_they_leave_goes(tmp_path):
+    (tmp_path / "killed.py").write_text(KILLED)
+    (tmp_path / "tmp").mkdir()
+    done = run_python(tmp_path / "killed.py", TMPDIR=str(tmp_path / "tmp"))
+    *heard, failures, left = done.stdout.splitlines()
+    assert heard, done.stderr
+    assert set(heard) == {"1"}
+    assert (failures, left) == ("find_pieces: its process died", "0")
 
 
-def test_processes_look_for_garbage_as_often_as_the_one_that_began_them(monkeypatch):
-    thresholds = []
-    monkeypatch.setattr(module.gc, "set_threshold", lambda *given: thresholds.append(given))
-    monkeypatch.setattr(module.signal, "signal", lambda *_: None)
-    ours, theirs = Pipe()
-    ours.send("")
-    module._work(theirs, "", (50_000, 20, 100))
-    assert thresholds == [(50_000, 20, 100)]
+@pytest.fixture
+def cold(tmp_path, monkeypatch):
+    """No kernel is at hand, and no example was ever run."""
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "cache"))
 
 
-def test_where_no_process_can_be_started_a_command_compiles_alone(monkeypatch):
-    monkeypatch.setattr(module, "num_cores", lambda: 2)
-    monkeypatch.setattr(module, "not_done", list)
+def compile_anew(say):
+    """Call a new kernel in a command; return its answer."""
+    with compile_together(print, say):
+        return kernel(lambda x: 2 * x)(21)
+
+
+def test_where_no_process_can_be_started_a_command_compiles_alone(cold, monkeypatch):
     monkeypatch.setattr("multiprocessing.get_context", no_process)
-    with compile_together(print, print):
-        miss()
+    assert compile_anew(print) == 42
 
 
 def no_process(_how):
     raise OSError("no more processes")
 
 
-@pytest.fixture
-def asked(monkeypatch):
-    """Warm-ups that a command asks for; none is done."""
-    calls = []
-    monkeypatch.setattr(module, "warm_up", lambda names, _tell: calls.append(list(names)))
-    monkeypatch.setattr(module, "num_cores", lambda: 2)
-    return calls
+def test_what_is_not_done_are_the_examples_that_never_ran(cold):
+    assert not_done() == [*NEEDED, *FURTHER]
+    for name in NEEDED[1:]:
+        kernel_cache.note(name, kernel_cache.PACKAGE / "pipeline")
+    assert not_done(NEEDED) == [NEEDED[0]]
 
 
-def miss():
-    """Miss a kernel, as a cache does."""
-    for act in list(kernel_cache._missed):
-        act()
-
-
-def test_a_miss_asks_for_the_examples_that_never_ran(asked, monkeypatch):
-    monkeypatch.setattr(module, "is_noted", lambda name, _folder: name != "solve_dense")
-    with compile_together(print, print):
-        miss()
-    assert asked == [["solve_dense"]]
-    monkeypatch.setattr(module, "num_cores", lambda: 1)
-    with compile_together(print, print):
-        miss()
-    monkeypatch.setattr(module, "is_noted", lambda _name, _folder: True)
-    monkeypatch.setattr(module, "num_cores", lambda: 2)
-    with compile_together(print, print):
-        miss()
-    miss()  # outside of any block
-    assert len(asked) == 1
-
-
-def test_a_wheel_for_another_numba_is_told_of(asked, monkeypatch):
-    monkeypatch.setattr(module, "made_for", lambda: "py311-numba0.61 on x86-64-v3")
-    monkeypatch.setattr(module, "is_noted", lambda _name, _folder: True)
+@pytest.mark.parametrize("other", ["py311-numba0.61 on x86-64-v3", ""])
+def test_a_wheel_for_another_numba_is_told_of(cold, monkeypatch, other):
+    monkeypatch.setattr(module, "made_for", lambda: other or kernel_cache.here())
+    for name in NEEDED:  # so that a miss starts no process
+        kernel_cache.note(name, kernel_cache.PACKAGE / "pipeline")
     said = []
-    with compile_together(print, said.append):
-        miss()
-    (sentence,) = said
-    assert "py311-numba0.61 on x86-64-v3" in sentence
-    assert kernel_cache.here() in sentence
-    monkeypatch.setattr(module, "made_for", kernel_cache.here)
-    with compile_together(print, said.append):
-        miss()
-    assert len(said) == 1
+    assert compile_anew(said.append) == 42
+    assert len(said) == bool(other)
+    assert all(other in sentence and kernel_cache.here() in sentence for sentence in said)
 
 
 def test_the_command_says_what_is_ready_or_what_failed(monkeypatch):

@@ -64,7 +64,7 @@ GAUGES = {
 
 
 @pytest.mark.parametrize("kind", GAUGES)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(log_scale=st.floats(-5.0, 5.0), shift=st.floats(-30.0, 30.0), seed=st.integers(0, 99))
 def test_a_gauge_undoes_scale_and_origin_of_the_solver_and_is_none_where_it_holds(
     kind, log_scale, shift, seed

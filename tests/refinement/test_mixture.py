@@ -11,7 +11,6 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.factor import analyze, factorize
 from sfm_shapefit.pipeline.place import place
-from sfm_shapefit.refinement import mixture
 from sfm_shapefit.refinement.length_prior import LengthPrior
 from tests.graph_families import random_blocks
 from tests.problems import no_mixture, shape_error
@@ -218,14 +217,6 @@ def test_standard_deviations_and_covariances_say_the_same(objective, on_street):
 def test_a_sigma_that_is_none_is_refused(sigma, message, on_street):
     with pytest.raises(InputError, match=message):
         place(on_street[0], sigma=sigma)
-
-
-def test_one_signature_of_the_kernel_serves_all_graphs(on_street):
-    place(corrupted(0.2, 2, n=20).view_graph)
-    place(
-        MeasuredGraph(on_street[0], covariance=np.tile(1e-4 * np.eye(2), (len(on_street[2]), 1, 1))),
-    )
-    assert len(mixture._expect.signatures) == 1
 
 
 @pytest.mark.parametrize("block", [1, 3])

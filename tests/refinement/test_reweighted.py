@@ -7,9 +7,7 @@ from sfm_shapefit import synthetic
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
-from sfm_shapefit.refinement import angular, reweighted, starts
 from sfm_shapefit.refinement.consensus import fit_mixture, penalty_of_strays, put_by_consensus
-from sfm_shapefit.solver import options as solver_options
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.solver.solve import solve
 from tests.problems import no_mixture, shape_error
@@ -38,27 +36,14 @@ def recovered(hopeless):
 
 
 @pytest.mark.parametrize(("d", "q"), [(2, 0.5), (3, 0.8)])
-def test_recovery_is_exact_where_the_usual_starts_collapse(d, q, monkeypatch):
+def test_recovery_is_exact_where_the_usual_starts_collapse(d, q):
     problem = corrupted(q, d)
     found = place(problem.view_graph)
     assert found.refined.start == "reweighted ShapeFit"
     assert shape_error(found.locations, problem.locations) < 1e-9
     np.testing.assert_array_equal(found.refined.posterior > 0.5, ~problem.corrupted)
-    monkeypatch.setattr(starts, "POOR_SHARE", 0.0)
-    assert shape_error(place(problem.view_graph).locations, problem.locations) > 0.02
-
-
-def test_where_a_factor_is_dear_only_the_reweighted_start_is_refined(hopeless, monkeypatch):
-    monkeypatch.setattr(angular, "_MAX_FLOPS", 0.0)
-    refined = []
-    refine = starts.refine_angles
-    monkeypatch.setattr(starts, "refine_angles", lambda *a: refined.append(a[0]) or refine(*a))
-    found = place(hopeless.view_graph)
-    assert found.refined.start == "reweighted ShapeFit"
-    assert shape_error(found.locations, hopeless.locations) < 1e-9
-    assert all(measured.graph.weights.min() < 1.0 for measured in refined)
-    place(corrupted(0.1, sigma=0.01).view_graph)
-    assert refined[-1].graph.weights.min() == 1.0
+    for usual in ("shapefit", "lud"):
+        assert shape_error(place(problem.view_graph, objective=usual).locations, problem.locations) > 0.02
 
 
 def test_the_answer_is_the_same_to_the_bit_for_any_number_of_threads(hopeless, recovered):
@@ -87,38 +72,17 @@ def test_the_certificate_is_that_of_the_program_at_the_weights_and_that_is_said(
     assert "at weights that are the pairs' posteriors" in refined.statement()
 
 
-def test_a_graph_that_is_explained_is_left_alone_and_so_is_an_objective_that_was_asked_for(
-    hopeless, monkeypatch
-):
-    monkeypatch.setattr(starts, "solve_reweighted", lambda *_: pytest.fail("nothing is to be tried"))
+def test_a_graph_that_is_explained_is_left_alone_and_so_is_an_objective_that_was_asked_for(hopeless):
     assert place(corrupted(0.2, sigma=0.02).view_graph).refined.reweighted is None
+    assert place(corrupted(0.4, sigma=0.02).view_graph).refined.reweighted is None  # all rays meet
     assert place(hopeless.view_graph, objective="shapefit").refined.start == "ShapeFit"
 
 
-def test_starts_of_many_pairs_are_solved_to_less_than_the_last_digit_unless_that_is_asked(
-    hopeless, monkeypatch
-):
-    for module in (solver_options, reweighted):
-        monkeypatch.setattr(module, "PAIRS_AT_SCALE", hopeless.view_graph.num_edges - 1)
-    asked = []
-
-    def listen(graph, told, **how):
-        asked.append(told)
-        return solve(graph, told, **how)
-
-    monkeypatch.setattr(reweighted, "solve", listen)
-    found = place(hopeless.view_graph)
-    assert {(told.tol, told.max_iterations) for told in asked} == {(1e-6, 60)}
-    assert found.certified.converged
-    assert shape_error(found.locations, hopeless.locations) < 1e-6
-    told = SolverOptions(tol=1e-9, max_iterations=500)
+def test_starts_of_many_pairs_are_solved_to_less_than_the_last_digit_unless_that_is_asked():
+    usual, told = SolverOptions(), SolverOptions(tol=1e-9, max_iterations=500)
+    assert usual.at_scale(10**6) == usual
+    assert (usual.at_scale(10**7).tol, usual.at_scale(10**7).max_iterations) == (1e-6, 60)
     assert told.at_scale(10**7) == told
-
-
-def test_an_answer_whose_rays_all_meet_stays_without_a_further_solve(monkeypatch):
-    problem = corrupted(0.4, sigma=0.02)
-    monkeypatch.setattr(reweighted, "solve", lambda *_, **__: pytest.fail("nothing is to be solved again"))
-    assert place(problem.view_graph).refined.reweighted is None
 
 
 def test_a_camera_of_a_single_right_pair_stays_in_the_scene():
@@ -134,22 +98,12 @@ def test_a_camera_of_a_single_right_pair_stays_in_the_scene():
     assert distances[7] < 10.0 * np.median(distances)
 
 
-def test_triangles_are_asked_too_where_a_consensus_has_moved_cameras_unless_pairs_are_many(monkeypatch):
+def test_triangles_are_asked_too_where_a_consensus_has_moved_cameras():
+    """Its end alone explains 38 % of the pairs, and is off by more than a tenth."""
     problem = synthetic.random_graph_problem(100, 0.5, q=0.6, seed=6)
-    asked, weigh = [], reweighted.weigh_by_triangles
-    monkeypatch.setattr(reweighted, "weigh_by_triangles", lambda graph: asked.append(graph) or weigh(graph))
-    found = place(problem.view_graph).refined
-    assert found.reweighted is not None
-    assert found.reweighted.mixture.shares[0] > reweighted._FEW
-    assert len(asked) == 1
-    monkeypatch.setattr(reweighted, "PAIRS_AT_SCALE", problem.view_graph.num_edges - 1)
-    assert place(problem.view_graph).refined.reweighted is not None
-    assert len(asked) == 1
-
-
-def test_an_answer_that_most_directions_point_against_has_no_scale_and_is_not_taken(hopeless, monkeypatch):
-    monkeypatch.setattr(reweighted, "projected_length", lambda *_: -1.0)
-    assert place(hopeless.view_graph).refined.reweighted is None
+    found = place(problem.view_graph)
+    assert found.refined.reweighted.mixture.shares[0] == pytest.approx(0.4, abs=0.02)
+    assert shape_error(found.locations, problem.locations) < 1e-9
 
 
 def test_an_answer_too_far_off_for_any_level_explains_nothing():

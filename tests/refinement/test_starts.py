@@ -11,10 +11,8 @@ from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
-from sfm_shapefit.refinement import angular
-from sfm_shapefit.refinement import starts as finishing
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.refinement.starts import COLLAPSED, Start, disagreement, refine_starts
+from sfm_shapefit.refinement.starts import COLLAPSED, Start, choose_start, disagreement, refine_starts
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from tests.problems import no_mixture, shape_error
@@ -62,15 +60,14 @@ def test_where_both_starts_agree_nothing_is_said_of_a_collapse_and_the_scale_is_
     np.testing.assert_allclose(found.locations.mean(axis=0), 0.0, atol=1e-12)
 
 
-def test_of_many_cameras_one_of_two_starts_that_agree_is_refined(chain, expander, monkeypatch):
-    both = finished(expander)
-    monkeypatch.setattr(finishing, "_MANY_CAMERAS", 40)
-    monkeypatch.setattr(finishing, "_SAME", 1.1 * both.disagreement)
-    found = finished(expander)
+def test_of_many_cameras_one_of_two_starts_that_agree_is_refined(chain):
+    many = synthetic.box_graph_problem(1000, 20.0, sigma=0.002, q=0.05, seed=1)
+    found = finished(many)
     assert list(found.costs) == ["ShapeFit"]
+    assert found.lud is not None
     assert "only one is refined" in found.reason
-    assert shape_error(found.locations, both.locations) < 1e-3
-    assert finished(expander, objective="lud").start == "LUD"
+    assert shape_error(found.locations, many.locations) < 1e-3
+    assert list(finished(many, objective="lud").costs) == ["ShapeFit", "LUD"]
     assert len(finished(chain).costs) == 2
 
 
@@ -128,7 +125,7 @@ def start(name: str, locations=None) -> Start:
 def test_the_lower_cost_is_kept_and_a_tie_of_disagreeing_starts_goes_to_lud(costs, apart, kept, word):
     starts = [start("ShapeFit"), start("LUD")]
     by_name = dict(zip(("ShapeFit", "LUD"), costs, strict=True))
-    chosen, reason = finishing._choose(TRIANGLE, starts, by_name, apart, PlacementOptions())
+    chosen, reason = choose_start(TRIANGLE, starts, by_name, apart, PlacementOptions())
     assert chosen.name == kept
     assert word in reason
 
@@ -140,31 +137,18 @@ def test_a_start_whose_cameras_stand_in_one_point_is_not_kept_whatever_it_costs(
     point[0] = spread[0]
     for lengths, kept in ((point, "LUD"), (spread, "ShapeFit")):
         starts = [start("ShapeFit", lengths), start("LUD", spread)]
-        chosen, _ = finishing._choose(
-            graph, starts, {"ShapeFit": 90.0, "LUD": 100.0}, 5.0, PlacementOptions()
-        )
+        chosen, _ = choose_start(graph, starts, {"ShapeFit": 90.0, "LUD": 100.0}, 5.0, PlacementOptions())
         assert chosen.name == kept
 
 
-def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypatch, expander):
-    monkeypatch.setattr(finishing, "PAIRS_AT_SCALE", 10)
-    for objective in ("auto", "lud"):
-        found = finished(expander, objective=objective)
-        assert found.start == "ShapeFit"
-        assert found.lud is None
-        assert found.disagreement is None
-        assert not found.collapsed
-        assert found.is_refined
-        assert "no second start" in found.reason
-
-
-def test_of_starts_that_are_alike_one_is_refined_where_a_factor_is_dear(monkeypatch, expander):
-    monkeypatch.setattr(angular, "_MAX_FLOPS", 0.0)
-    found = finished(expander)
-    assert list(found.costs) == ["ShapeFit"]
-    assert found.lud is not None
-    assert "so that only one is refined" in found.reason
-    assert list(finished(expander, objective="lud").costs) == ["ShapeFit", "LUD"]
+@pytest.mark.parametrize("objective", ["auto", "lud"])
+def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(objective):
+    found = finished(synthetic.random_graph_problem(2, 1.0, seed=1), objective=objective)  # two cameras
+    assert found.start == "ShapeFit"
+    assert found.lud is None
+    assert found.disagreement is None
+    assert not found.collapsed
+    assert "no second start" in found.reason
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -189,13 +173,7 @@ def test_the_smallest_graphs_are_finished(n, d):
     assert (found.lud is None) == (n == 2)
 
 
-def test_too_large_a_factor_is_refused_with_the_reason(monkeypatch, expander):
-    exact = finished(expander)
-    with monkeypatch.context() as patch:
-        patch.setattr(angular, "_MAX_FLOPS", 10.0)
-        found = finished(expander)  # without a factor, and as good
-        assert found.is_refined
-        np.testing.assert_allclose(found.locations, exact.locations, atol=1e-3 * np.ptp(exact.locations))
+def test_too_large_a_factor_is_refused_with_the_reason(expander):
     found = finished(synthetic.box_graph_problem(400, 24.0, seed=1), factor_memory_mb=1)  # MB
     assert not found.is_refined
     assert found.statement().endswith("not refined, since the factor for that would be too large")

@@ -247,7 +247,7 @@ def test_one_pair_and_bridges_are_followed_and_their_sigmas_are_those_given():
     assert chain.rotations[1] @ chain.rotations[2].T == pytest.approx(rotations[1], abs=1e-12)
     # Two cameras are each half of the difference off their mean. In a chain of three, the middle one is off
     # by a third of the sum of both differences, the outer ones by (2, 1) / 3 of them; c is that of the loss.
-    added = np.hypot(0.5, 0.05) * np.sqrt(averaging_uncertainty._LOSS_FACTOR)
+    added = np.hypot(0.5, 0.05) * np.sqrt(0.823)
     assert pair.sigmas_deg == pytest.approx([added / 2.0] * 2)
     assert chain.sigmas_deg == pytest.approx(added * np.sqrt([5.0, 2.0, 5.0]) / 3.0)
     assert pair.certified

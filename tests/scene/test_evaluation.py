@@ -40,7 +40,7 @@ def in_another_world(poses: Poses, seed: int) -> Poses:
 
 
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(3, 25))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_the_same_cameras_in_another_world_have_no_error(seed, n):
     reference = scene(seed, n)
     found = evaluate_poses(in_another_world(reference, seed + 1), reference)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import shutil
 from contextlib import closing
 
 import numpy as np
@@ -11,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.database import DatabaseMatches, open_database
+from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.scene import matches as scene_matches
 from sfm_shapefit.scene.matches import PLENTY, KeypointMatches, Matches, Reading
-from tests.scenes import RING
+from tests.scenes import RING, edit_database
 
 READINGS = {
     "all is kept": PLENTY,
@@ -189,38 +190,18 @@ def test_parts_are_read_elsewhere_to_the_same_bits(tiny_ring, model):
     assert len(TrackMatches(model).at(model.images).parts(700)) == 0  # only this process has the model
 
 
-def test_a_part_does_not_read_the_table_of_all_pairs(tiny_ring, model, monkeypatch):
-    with closing(open_database(tiny_ring / "database.db", model.images.names)) as matches:
-        (part,) = matches.at(model.images).parts(10**9)
-    monkeypatch.delattr("sfm_shapefit.files.colmap.database.read_pairs")
-    with part.open() as view:
-        assert sum(len(batch.pairs) for batch in view.batches()) == part.num_pairs
-
-
-def test_what_was_read_once_is_read_again_by_no_view(tiny_ring, model, monkeypatch):
-    with closing(open_database(tiny_ring / "database.db", model.images.names)) as matches:
+def test_what_was_read_once_is_read_again_by_no_view(tiny_ring, model, tmp_path):
+    path = shutil.copyfile(tiny_ring / "database.db", tmp_path / "database.db")
+    with closing(open_database(path, model.images.names)) as matches:
         expected = columns(matches.at(model.images).batches())
-        for reading in ("_read_matches", "_read_keypoints"):  # nothing may be read from here on
-            monkeypatch.setattr(DatabaseMatches, reading, None)
+        edit_database(path, "UPDATE keypoints SET data = NULL", "UPDATE two_view_geometries SET data = NULL")
         again = columns(matches.at(turned(model).images).batches())
         np.testing.assert_array_equal(
             columns(matches.at(model.images).batches())["rays_i"], expected["rays_i"]
         )
         matches.forget()
-        with pytest.raises(TypeError):
-            matches.at(model.images).keypoints(0)
+        assert len(matches.at(model.images).keypoints(0)) == 0
     assert_same_bits({name: again[name] for name in ("pairs", "keypoints", "counts")}, expected)
-
-
-def test_keypoints_of_very_many_are_read_each_time(tiny_ring, model, monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.files.colmap.database.MOST_KEYPOINTS", 10)
-    with closing(open_database(tiny_ring / "database.db", model.images.names)) as matches:
-        view = matches.at(model.images)
-        before = view.keypoints(0)
-        monkeypatch.setattr(
-            DatabaseMatches, "_read_keypoints", lambda _self, _name: np.zeros((1, 2), np.float32)
-        )
-        assert len(before) > len(view.keypoints(0)) == 1
 
 
 def test_of_wanted_pairs_no_others_are_yielded(matches, model):
@@ -235,22 +216,11 @@ def test_consumed_links_give_back_very_many_matches_and_what_was_yielded_stays(t
     with closing(open_database(tiny_ring / "database.db", model.images.names)) as matches:
         view, other = matches.at(model.images), matches.at(turned(model).images)
         (whole,) = view.links()
-        reads, read = [], DatabaseMatches._read_matches
-        monkeypatch.setattr(
-            DatabaseMatches, "_read_matches", lambda *given: reads.append(given) or read(*given)
-        )
-        list(view.links(consume=True))
-        list(view.links())
-        assert not reads
         monkeypatch.setattr(scene_matches, "MOST_BESIDE_TRACKS", view.num_matches - 1)
         before = whole.keypoints.copy()
         list(view.links(consume=True))
         np.testing.assert_array_equal(whole.keypoints, before)
         (again,), (shared,) = view.links(), other.links()
-        assert len(reads) == 1
-        matches.at(model.images, reading=Reading(keeps=False))  # which takes the memory of all
-        list(other.links())
-        assert len(reads) == 2
     for found in (again, shared):
         assert isinstance(found, KeypointMatches)
         np.testing.assert_array_equal(found.keypoints, before)

@@ -25,7 +25,7 @@ def changed(recorded, path, value):
 
 
 def recorded_once(folder):
-    folders = answers._folders(folder)
+    folders = answers.folders_of(folder)
     chosen = answers.choose(folders, only=CASE, quick=True)
     return {name: one for found in answers.record(ROOT, folders, chosen) for name, one in found.items()}
 
@@ -114,7 +114,7 @@ def test_an_interrupted_recording_is_read_and_continued(tmp_path):
     path.write_bytes(path.read_bytes()[:-20])
     assert answers.read(path) == {"first": one[CASE]}
     assert path.read_bytes().startswith(whole)
-    folders = answers._folders(tmp_path)
+    folders = answers.folders_of(tmp_path)
     assert [case.name for case in answers.choose(folders, only=CASE)] == [CASE]
     assert answers.choose(folders, only=CASE, done=[CASE]) == []
 
@@ -133,7 +133,7 @@ def test_a_word_with_a_value_becomes_a_key_of_the_configuration(tmp_path):
 
 
 def test_names_of_cases_are_unique_and_missing_sets_are_skipped(tmp_path):
-    folders = answers._folders(tmp_path)
+    folders = answers.folders_of(tmp_path)
     names = [c.name for case in all_cases(folders) for c in (case, *case.followers)]
     assert len(set(names)) == len(names)
     chosen = answers.choose(folders, only="locate/castle-P30/default")

@@ -102,10 +102,8 @@ def test_a_fresh_process_has_the_threads_that_were_asked_for_and_its_failure_is_
 
 
 def test_a_process_that_takes_too_long_is_ended():
-    start = time.perf_counter()
     with pytest.raises(TimeoutError, match=r"no answer within 0\.1 s"):
         process.call(time.sleep, 60.0, timeout_s=0.1)
-    assert time.perf_counter() - start < 20.0
     with pytest.raises(TimeoutError, match="no answer within 1 s of CPU time"):
         process.call(sum, itertools.repeat(0), cpu_limit_s=1)
 

@@ -16,7 +16,7 @@ from paper import peers_on_graphs as on_graphs
 from paper import peers_on_scenes as on_scenes
 from paper.cone_solvers import solve_cvxpy, solve_direct
 from paper.peers_on_scenes import BY_DEFAULT, POSITIONING, SAME_DIRECTIONS, Answer, checks
-from sfm_shapefit import ViewGraph, certify
+from sfm_shapefit import certify
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from tests.scenes import RING, fingerprint, real_scene
 from tests.scripts.test_benchmarks import call_here
@@ -139,20 +139,6 @@ def test_ours_must_not_be_worse_than_the_best_peer_beyond_what_the_truth_can_tel
     assert not median.met
     assert mean.met
     assert checks(rows(errors(1.0, 1.0), None)) == []
-
-
-def test_peers_see_the_cameras_of_the_model_by_name(monkeypatch):
-    folder = real_scene("fountain-P11")
-    graph = ViewGraph(3, np.array([[0, 1], [1, 2], [2, 0]]), np.eye(3))
-    directions = on_scenes.Directions(("0004.jpg", "0002.jpg", "0007.jpg"), graph)
-    contender = on_graphs.Contender(
-        name="fixed", prepare=lambda _: lambda: (np.arange(9.0).reshape(3, 3), "done"), package="x"
-    )
-    monkeypatch.setattr(on_scenes, "GRAPH_CONTENDERS", (contender,))
-    monkeypatch.setattr(on_scenes, "_errors", lambda centers, *_: list(centers))
-    found = on_scenes._solve("fixed", folder, SCENES[folder.name], directions)
-    assert found.error == ["0004.jpg", "0002.jpg", "0007.jpg"]
-    assert found.peak_mb > 10.0
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """The certificate: what it makes of approximate duals, of spoilt ones, and of graphs it cannot serve."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -9,15 +7,14 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.solver import certificate
 from sfm_shapefit.solver.certificate import certify, certify_in_place
 from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.program import across, adjoint, differences, objective, scale_functional
-from sfm_shapefit.solver.splitting import split_then_newton as hybrid
-from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
-from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
+from sfm_shapefit.solver.splitting.engine import Goal
+from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources
+from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, Splitting, solve_hybrid
 from tests.graph_families import FAMILIES
-from tests.problems import exact_graph, measure_graph, solve_admm
+from tests.problems import CountedFactor, draw_graph, exact_graph, measure_graph, solve_admm
 
 
 def draw_family(family, n, degree, *, sigma=0.01, q=0.2, seed=1):
@@ -84,50 +81,47 @@ def test_the_repaired_dual_is_feasible_and_closer_than_by_the_unit_metric(
     assert certificate.dual_bound > 0.0 or sigma == 0.0
 
 
-def test_a_repair_stops_at_the_gap_asked_for_and_is_the_same_for_two_threads(monkeypatch):
-    graph = draw_family("comm", 400, 40)
-    split = solve_admm(graph, 1e-12, 100)
-    steps = []
+def test_a_repair_ends_at_the_gap_asked_for_and_soon_where_that_is_out_of_reach():
+    graph = draw_family("comm", 1200, 30)
+    split = solve_admm(graph, 1e-4, 200)
 
-    def counted(*args, **kwargs):
-        found = conjugate_gradients(*args, **kwargs)
-        steps.append(found.iterations)
-        return found
+    def certified(tol, hopeless=np.inf):
+        factor = CountedFactor(graph)
+        dual, resources = split.dual.copy(), Resources(factor=factor)
+        return certify_in_place(graph, split.locations, dual, tol, hopeless, resources), factor.solved
 
-    monkeypatch.setattr(certificate, "conjugate_gradients", counted)
-    monkeypatch.setattr(certificate, "_LARGE", 0)  # blocks of pairs, as for a large graph
-    best = certify(graph, split.locations, split.dual)
-    most, enough = len(steps), 10.0 * best.gap
-    steps.clear()
-    found = certify(graph, split.locations, split.dual, tol=enough)
-    assert len(steps) < most
+    best, most = certified(0.0)
+    for tol, hopeless in ((10.0 * best.gap, np.inf), (2.0 * best.gap, 2.0 * best.gap)):
+        found, solved = certified(tol, hopeless)
+        assert_feasible(graph, found)
+        assert best.gap <= found.gap <= tol  # rounds may end earlier than for the best bound
+        assert solved < most
+    missed, solved = certified(0.3 * best.gap, 0.3 * best.gap)
+    assert missed is None
+    assert solved < 0.5 * most  # it comes to no exact repair
+
+
+def test_a_certificate_of_very_many_pairs_is_the_same_for_two_threads():
+    graph = draw_family("er", 2100, 200)  # 200,000 pairs, from which on sums are formed in blocks
+    split = solve_admm(graph, 1e-12, 6)
+    one, two = (
+        certify_in_place(graph, split.locations, split.dual.copy(), 1.0, np.inf, Resources(threads))
+        for threads in (1, 2)
+    )
+    assert one.gap < 1.0
+    assert_feasible(graph, one)
+    np.testing.assert_array_equal(one.dual, two.dual)
+
+
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_a_dual_a_little_off_proves_nearly_the_optimum_in_any_dimension(d):
+    graph, _ = draw_graph(d, n=24, p=0.7, d=d, sigma=0.05, weighted=True)
+    t, y, _ = solve_newton_sparse(graph, 1e-10, 60)
+    off = 1e-3 * np.random.default_rng(d).standard_normal(y.shape)
+    found = certify(graph, t, y + off)
     assert_feasible(graph, found)
-    assert best.gap < found.gap <= enough
-    again = certify_in_place(graph, split.locations, split.dual.copy(), enough, np.inf, Resources(threads=2))
-    assert np.array_equal(again.dual, found.dual)
-
-
-@pytest.mark.parametrize(
-    ("excess", "tol", "hopeless", "rounds"),
-    [
-        ((1e-3, 1e-4, 1e-5, 1e-6), 1e-4, np.inf, 3),  # after two the gap is small, but not what comes of it
-        ((1e-3, 1e-4, 1e-5, 1e-6), 1e-3, np.inf, 2),
-        ((1e-3, 1e-4, 1e-5, 1e-6), 0.0, np.inf, 4),  # the best bound: 1e-6 of excess is 2 % of the gap
-        ((1e-3, 1e-4, 1e-5, 1e-6), 5e-6, np.inf, 3),  # missed anyway: 20 % will do
-        ((1e-3, 1e-4, 1e-5, 1e-6), 5e-6, 5e-6, 1),  # given up at the second clipping
-    ],
-)
-def test_clipping_goes_on_until_the_exact_repair_will_not_spoil_it(
-    excess, tol, hopeless, rounds, monkeypatch
-):
-    restored = iter(excess)
-    done = []
-    monkeypatch.setattr(certificate, "_clip", lambda _: None)
-    monkeypatch.setattr(certificate, "_violation", lambda *_: (0.2, None))
-    monkeypatch.setattr(certificate, "_restore", lambda *_: done.append(1) or 1.0 + next(restored))
-    gap = certificate._clip_in_rounds(SimpleNamespace(metric=None), None, None, 0.20001, tol, hopeless)
-    assert len(done) == rounds
-    assert gap == pytest.approx(1e-5 + (0.2 * excess[rounds - 1] if hopeless > 1.0 else 0.0), rel=1e-2)
+    # What leaves the balls lowers the bound, by the metric of ones about as much as it is changed.
+    assert 0.0 < found.gap < 0.1 * (found.objective - unit_bound(graph, t, y + off))
 
 
 def test_no_spoilt_dual_proves_more_than_the_optimum_and_wrong_locations_still_prove_a_bound():
@@ -167,13 +161,6 @@ def test_a_dual_whose_sums_overflow_proves_nothing(size):
     assert certificate.dual_bound <= objective(graph, t) + 1e-12
 
 
-@pytest.mark.parametrize("row", [0, 1])
-def test_a_violation_that_is_not_a_number_is_the_largest(row):
-    total = np.ones((2, 3))
-    total[row, 1] = np.nan
-    assert certificate._unbalanced(total, np.zeros((2, 3)), 0.0) == np.inf
-
-
 @pytest.mark.parametrize("n", [2, 3, 4, 12])
 def test_exact_directions_need_no_more_than_the_zero_dual(n):
     graph, t = complete(n)
@@ -182,77 +169,6 @@ def test_exact_directions_need_no_more_than_the_zero_dual(n):
         certificate = certify(graph, t, dual)
         assert certificate.gap <= 1e-12
         assert certificate.equality_residual <= 1e-12
-
-
-def random_metric(d):
-    """Return a metric of 9 cameras whose dual lies inside some balls, on some and outside of others."""
-    rng = np.random.default_rng(d)
-    edges = np.array([(i, j) for i in range(9) for j in range(i)])[rng.permutation(36)[:20]]
-    v, y = rng.standard_normal((2, 20, d))
-    v /= np.linalg.norm(v, axis=1, keepdims=True)
-    y -= np.sum(y * v, axis=1, keepdims=True) * v
-    w, stiffness = rng.uniform(0.5, 2.0, (2, 20))
-    stiffness = (np.round(16.0 * stiffness) / 16.0).astype(np.float32)
-    norms = np.repeat([0.3, 0.995, 1.7, 5.0], 5) * w
-    y *= (norms / np.linalg.norm(y, axis=1))[:, None]
-    # Few digits, so that the kernels' products of two numbers of single precision are exact.
-    normal = np.where(np.arange(20) % 2, np.round(32.0 * np.sqrt(0.97) / norms) / 32.0, 0.0).astype(
-        np.float32
-    )
-    for array in (edges, v, w):
-        array.flags.writeable = False  # as those of a graph, for which the kernels are compiled
-    metric = certificate._Metric(edges, v, w, stiffness, y, normal, tuple(range(d)))
-    incidence = np.zeros((20, 9))
-    incidence[np.arange(20), edges[:, 0]], incidence[np.arange(20), edges[:, 1]] = 1.0, -1.0
-    return metric, incidence, rng
-
-
-@pytest.mark.parametrize("d", [2, 3, 5])
-def test_clipping_shortens_the_dual_to_its_balls_and_names_their_normals(d):
-    metric, _, _ = random_metric(d)
-    norms = np.linalg.norm(metric.y, axis=1)
-    clipped = metric.y * np.minimum(1.0, metric.w / norms)[:, None]
-    certificate._clip(metric)
-    np.testing.assert_allclose(metric.y, clipped, rtol=1e-14)
-    surface = np.sqrt(0.97) / np.linalg.norm(clipped, axis=1)
-    np.testing.assert_allclose(metric.normal, np.where(norms > 0.99 * metric.w, surface, 0.0), rtol=1e-7)
-
-
-@pytest.mark.parametrize("d", [2, 3, 5])
-def test_a_step_moves_the_dual_by_the_metric_and_leaves_it_orthogonal(d):
-    metric, incidence, rng = random_metric(d)
-    h, y, v = rng.standard_normal((9, d)), metric.y.copy(), metric.v
-    moved = incidence @ h
-    flat = moved - np.sum(moved * v, axis=1, keepdims=True) * v
-    u = metric.normal[:, None] * y
-    step = metric.stiffness[:, None] * (flat - np.sum(flat * u, axis=1, keepdims=True) * u)
-    total = np.empty((9, d))
-    certificate._apply(metric, 0, 20, h, total)
-    np.testing.assert_allclose(total, incidence.T @ step, atol=1e-13)
-
-    metric.y[:] += 1e-3 * v  # what rounding might have left along v goes, too
-    y += 1e-3 * v
-    along_y = np.sum(moved * y, axis=1) * metric.normal.astype(float) ** 2
-    expected = y - metric.stiffness[:, None] * (flat - along_y[:, None] * y)
-    worst = certificate._move(metric, h)
-    np.testing.assert_allclose(metric.y, expected - np.sum(expected * v, axis=1)[:, None] * v, atol=1e-13)
-    assert np.abs(np.sum(metric.y * v, axis=1)).max() < 1e-14
-    assert worst == pytest.approx(np.max(np.linalg.norm(metric.y, axis=1) / metric.w), rel=1e-14)
-
-
-@pytest.mark.parametrize("size", [0.2, 1.0])
-def test_projecting_a_dual_tells_its_sums_and_how_far_it_is_outside(size):
-    metric, incidence, rng = random_metric(3)
-    v, w = metric.v, metric.w
-    y = size * w[:, None] * rng.uniform(-0.5, 0.5, (20, 3)) + rng.standard_normal((20, 1)) * v
-    flat = y - np.sum(y * v, axis=1, keepdims=True) * v
-    c, total, degrees = np.zeros((9, 3)), np.zeros((9, 3)), np.zeros(9)
-    worst = certificate._project(metric.edges, v, w, y, c, total, degrees)
-    np.testing.assert_allclose(y, flat, atol=1e-14)
-    np.testing.assert_allclose(c, incidence.T @ (w[:, None] * v), atol=1e-14)
-    np.testing.assert_allclose(total, incidence.T @ flat, atol=1e-14)
-    np.testing.assert_allclose(degrees, np.abs(incidence).T @ w, rtol=1e-14)
-    assert worst == pytest.approx(np.max(np.linalg.norm(flat, axis=1) / w), rel=1e-12)
 
 
 def test_a_graph_in_two_pieces_is_refused():
@@ -338,54 +254,36 @@ def test_the_hybrid_ends_where_it_is_told_to():
     assert cancelled.iterations == 20
 
 
-def test_the_splitting_goes_on_for_what_the_certificate_missed(monkeypatch):
-    graph = draw_family("geo", 400, 24)
-    monkeypatch.setattr(hybrid, "_FIRST_TARGET_PER_TOL", 300.0)  # so that the first certificate misses
+def test_the_splitting_goes_on_for_what_the_certificate_missed():
+    graph = draw_family("geo", 200, 16, sigma=0.03, seed=3)
+    splitting = Splitting(graph, Resources())
+    first = splitting.run(Goal(0.0, 0.3e-6, 2000), None)  # as far as the hybrid goes at first
+    splitting.close()
+    assert certify(graph, first.locations, first.dual).gap > 1e-6
     again = solve_hybrid(graph, 1e-6, 2000)
     assert (again.stop, again.factorizations) == (HybridStop.CERTIFIED, 0)
-    monkeypatch.setattr(hybrid, "_CERTIFICATES", 1)
-    once = solve_hybrid(graph, 1e-6, 2000)
-    assert (once.stop, once.iterations < again.iterations) == (HybridStop.NEWTON, True)
+    assert first.iterations < again.iterations < 2.0 * first.iterations
 
 
-def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_given_up(monkeypatch):
-    graph = draw_family("comm", 1200, 30)
-    split = solve_admm(graph, 1e-4, 200)
-    whole = certify(graph, split.locations, split.dual)
-
-    def certify_within(tol):
-        return certify_in_place(graph, split.locations, split.dual.copy(), tol, tol, Resources())
-
-    within = certify_within(2.0 * whole.gap)
-    assert whole.gap <= within.gap <= 2.0 * whole.gap  # rounds may end earlier than for the best bound
-    assert_feasible(graph, within)
-    monkeypatch.setattr(certificate, "_restore_exactly", None)  # out of reach, it comes to no exact repair
-    assert certify_within(0.3 * whole.gap) is None
-
-
-@pytest.mark.parametrize("cheap", [True, False])
-def test_newton_begins_at_the_split_point_and_then_anew_where_that_is_cheap(cheap, monkeypatch):
-    graph = draw_family("seq", 300, 36, q=0.1)
-    flops = 27.0 * laplacian_factor(graph).plan.flops
-    monkeypatch.setattr(hybrid, "_CHEAP_FLOPS", flops if cheap else 0.99 * flops)
-    monkeypatch.setattr(hybrid, "_NEWTON_STEPS", 1)  # too few from either point
-    result = solve_hybrid(graph, 1e-8, 2000)
-    assert (result.stop, result.factorizations) == (HybridStop.INACCURATE, 1 + cheap)
-    monkeypatch.setattr(hybrid, "_NEWTON_FLOPS", 0.99 * flops)
-    assert solve_hybrid(graph, 1e-8, 2000).stop is HybridStop.TOO_LARGE
+def test_newton_begins_at_the_split_point_and_then_anew_where_a_factor_is_cheap():
+    graph = draw_family("seq", 200, 24, q=0.1)
+    result = solve_hybrid(graph, 1e-16, 2000)  # below rounding
+    assert (result.stop, result.factorizations) == (HybridStop.INACCURATE, 30 + 30)
+    assert 0.0 < result.certificate.gap < 1e-11
 
 
 @pytest.mark.parametrize("slides", [False, True])
-@pytest.mark.parametrize("n", [12, 160])  # with 13 or 161 cameras: double precision alone, and single first
-def test_uniqueness_is_judged_alike_by_a_dense_and_by_a_sparse_factor(n, slides, monkeypatch):
-    graph, t = complete(n)
+@pytest.mark.parametrize(
+    ("n", "reach"),  # a dense factor in double precision, in single precision first, and a sparse one
+    [(12, 12), (160, 160), (200, 4)],
+)
+def test_uniqueness_is_judged_alike_by_any_factor(n, reach, slides):
+    t = np.random.default_rng(0).normal(size=(n, 3))
+    graph = exact_graph(t, [(i, j) for i in range(n) for j in range(max(0, i - reach), i)])
     if slides:  # the last camera hangs on the first by one pair, and fits wherever it stands along it
         edges = np.vstack([graph.edges, [[0, n]]])
         graph = ViewGraph(n + 1, edges, np.vstack([graph.directions, [[0.0, 0.0, 1.0]]]))
         t = np.vstack([t, t[0] - [0.0, 0.0, 1.0]])
     dual = np.zeros(graph.directions.shape)
     assert certify(graph, t, dual).unique is None
-    by_dense = certify(graph, t, dual, uniqueness=True).unique
-    monkeypatch.setattr(certificate, "prefers_dense_factor", lambda *_: False)
-    assert certify(graph, t, dual, uniqueness=True).unique is by_dense
-    assert by_dense is not slides
+    assert certify(graph, t, dual, uniqueness=True).unique is not slides

