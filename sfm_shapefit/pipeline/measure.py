@@ -141,7 +141,7 @@ def _again(source: MatchSource, directions: PairDirections) -> Iterator[tuple[Ma
 class _Beside:
     """What is made of each batch beside its directions."""
 
-    def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted, threads: int) -> None:
+    def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted, threads: int = 1) -> None:
         view, self._threads = source.view, threads
         self._threshold_px, self._num_usable, self._counts_pairs = threshold_px, 0, wanted.facts
         is_sampled = wanted.errors and view.num_pairs <= _MOST_PAIRS
