@@ -188,7 +188,7 @@ def ground_system(problem: AdjustmentProblem, options: AdjustmentOptions) -> Gro
         UnsolvableError: if the observations leave more open than a similarity.
     """
     layout = lay_out(problem, options)
-    workers = Workers(options.num_threads())
+    workers = Workers(options.threads)
     normal = linearize_all(problem, layout, values_of(problem), options, workers)
     unseen = np.zeros(problem.num_frames, np.bool_)
     own = layout.node_of_frame >= 0

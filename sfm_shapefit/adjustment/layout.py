@@ -12,15 +12,16 @@ Where nothing but free sensors tells the scale, the longest of their baselines k
 moves in the plane across it, `sensor_bases` has no third column, and the slot is empty.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, frozen
 from sfm_shapefit.base.geometry import normalized, tangent_bases
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import Workers, group_by
@@ -129,12 +130,14 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
     lens_node = node_of_lens[problem.lens_of_camera]
     sensor_node = np.append(node_of_sensor, -1)[sensor_of_camera]
     nodes = np.stack([frame_node, lens_node, sensor_node])
-    workers = Workers(options.num_threads())
-    first_entry, entry_node, where = _entries(first_observation, camera, nodes, workers)
+    workers = Workers(options.threads)
+    where = np.full((3, len(camera)), -1)  # as it stays where there is no entry
+    enter = partial(_enter, first_observation, camera, nodes, where)
+    first_entry, entry_node = _list(enter, first_observation, workers)
     entry_point = np.repeat(np.arange(problem.num_points), np.diff(first_entry))
-    first_of_node, by_node = group_by(entry_node, len(active))
-    structure = (first_of_node, by_node, entry_point, entry_node, first_entry)
-    first_pair, seconds = _pairs(structure, workers)
+    first_of_node, by_node = group_by(frozen(entry_node), len(active))
+    meet = partial(_meet, first_of_node, by_node, entry_point, entry_node, first_entry)
+    first_pair, seconds = _list(meet, first_of_node, workers)
     workers.close()
     pairs = np.stack([np.repeat(np.arange(len(active)), np.diff(first_pair)), seconds], axis=1)
     links, links_of_camera = _links(nodes, camera)
@@ -261,29 +264,6 @@ def _pack(problem: AdjustmentProblem, sizes: IntArray) -> tuple[IntArray, IntArr
     return packs, first_slots
 
 
-def _entries(
-    first_observation: IntArray, camera: IntArray, nodes: IntArray, workers: Workers
-) -> tuple[IntArray, IntArray, IntArray]:
-    """Return where the entries of each point begin (k + 1,), their nodes, and those of observations (3, m).
-
-    The nodes (3, c) are those of each camera's frame, lens and sensor, `camera` that of each observation.
-    """
-    first_entry = np.zeros(len(first_observation), np.int64)
-    where = np.full((3, len(camera)), -1)  # as it stays where there is no entry
-
-    def work(out: IntArray) -> None:
-        def of_points(begin: int, end: int) -> None:
-            _enter(begin, end, first_observation, camera, nodes, first_entry, out, where)
-
-        workers.share(first_observation, of_points, _WORTH_A_THREAD)
-
-    work(np.empty(0, np.int64))
-    np.cumsum(first_entry, out=first_entry)
-    entry_node = np.empty(int(first_entry[-1]), np.int64)
-    work(entry_node)
-    return first_entry, entry_node, where
-
-
 def _links(nodes: IntArray, camera: IntArray) -> tuple[IntArray, IntArray]:
     """Return the nodes that an observation ties, and the places of each camera's three ties (3, c), or -1.
 
@@ -299,31 +279,25 @@ def _links(nodes: IntArray, camera: IntArray) -> tuple[IntArray, IntArray]:
     return links, links_of_camera
 
 
-def _pairs(structure: tuple[IntArray, ...], workers: Workers) -> tuple[IntArray, IntArray]:
-    """Return the pairs: where those of each node begin, (N + 1,), and their second nodes, ascending.
+def _list(write: Callable[..., None], starts: IntArray, workers: Workers) -> tuple[IntArray, IntArray]:
+    """Return what a kernel lists for each row, as where the lists begin (n + 1,) and all items.
 
-    The structure is what a layout has of its entries by node and by point.
+    Called with `first` and `out`, it counts the items of row i into first[i + 1], or writes them if `out` has
+    room. Rows are shared out by `starts`, see `Workers.share`.
     """
-    first = np.zeros(len(structure[0]), np.int64)
-
-    def work(out: IntArray) -> None:
-        def of_nodes(begin: int, end: int) -> None:
-            _meet(begin, end, structure, first, out)
-
-        workers.share(structure[0], of_nodes, _WORTH_A_THREAD)
-
-    work(np.empty(0, np.int64))
+    first, out = np.zeros(len(starts), np.int64), np.empty(0, np.int64)
+    workers.share(starts, partial(write, first, out), _WORTH_A_THREAD)
     np.cumsum(first, out=first)
-    seconds = np.empty(int(first[-1]), np.int64)
-    work(seconds)
-    return first, seconds
+    out = np.empty(int(first[-1]), np.int64)
+    workers.share(starts, partial(write, first, out), _WORTH_A_THREAD)
+    return first, out
 
 
 @kernel
 def _enter(
-    begin: int, end: int, first_observation: Any, camera: Any, nodes: Any, first: Any, out: Any, where: Any
-) -> None:  # fmt: skip
-    """Count the nodes that see each point p into first[p + 1]; or, if `out` has room, list them in order."""
+    first_observation: Any, camera: Any, nodes: Any, where: Any, first: Any, out: Any, begin: int, end: int
+) -> None:
+    """List the nodes that see each of some points, ascending; if there is room, write entries where seen."""
     longest = 0
     for p in range(begin, end):
         longest = max(longest, first_observation[p + 1] - first_observation[p])
@@ -361,9 +335,11 @@ def _insert(node: int, found: Any, count: int) -> int:
 
 
 @kernel
-def _meet(begin: int, end: int, structure: Any, first: Any, out: Any) -> None:
-    """Count the later nodes that each node i meets into first[i + 1]; or, if `out` has room, list them."""
-    first_of_node, by_node, entry_point, entry_node, first_entry = structure
+def _meet(
+    first_of_node: Any, by_node: Any, entry_point: Any, entry_node: Any, first_entry: Any,
+    first: Any, out: Any, begin: int, end: int,
+) -> None:  # fmt: skip
+    """List the later nodes that each of some nodes meets, ascending."""
     mark = np.full(len(first) - 1, -1, np.int64)
     for i in range(begin, end):
         count, last = 0, i

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sfm_shapefit.base.settings import Settings, explained, option
-from sfm_shapefit.base.threads import MAX_THREADS, count_threads
+from sfm_shapefit.base.threads import MAX_THREADS
 
 LinearSolver = Literal["auto", "dense", "sparse"]
 
@@ -67,7 +67,3 @@ class AdjustmentOptions(Settings):
         self.check_range("first_damping", 0.0, 1.0)
         self.check_range("max_iterations", 1)
         self.check_range("threads", 0, MAX_THREADS)
-
-    def num_threads(self) -> int:
-        """Return the number of threads to use."""
-        return count_threads(self.threads)

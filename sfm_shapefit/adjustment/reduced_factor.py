@@ -53,9 +53,9 @@ def choose_factor(
     dense_up_to = {"auto": _DENSE_LIMIT, "dense": np.inf, "sparse": 0}[options.linear_solver]
     dense = layout.num_unknowns <= dense_up_to
     return (
-        DenseFactor.plan(layout, options.num_threads())
+        DenseFactor.plan(layout, options.threads)
         if dense
-        else SparseFactor.plan(layout, options.num_threads(), dtype)
+        else SparseFactor.plan(layout, options.threads, dtype)
     )
 
 

@@ -181,7 +181,7 @@ class _Pulls:
         self.given = kernel_inputs(system.layout, values_of(problem), options.loss_scale_px)
         self.windows = _windows(problem)
         self.groups = _group_neighbors(problem.points)
-        self.workers = Workers(options.num_threads())
+        self.workers = Workers(options.threads)
 
     def draw(
         self, calibration_px: float, lens_errors_px: FloatArray, turn_sigmas_rad: FloatArray

@@ -234,7 +234,7 @@ class _Run:
 
     def __init__(self, problem: AdjustmentProblem, options: AdjustmentOptions) -> None:
         self.problem, self.options = problem, options
-        self.workers = Workers(options.num_threads())
+        self.workers = Workers(options.threads)
         self.layout = lay_out(problem, options)
         hand_back_memory()  # what the layout was made of goes before the largest arrays come
         self.factor: ReducedFactor = choose_factor(self.layout, options, np.float32)

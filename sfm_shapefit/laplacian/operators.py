@@ -20,6 +20,7 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.threads import count_threads
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,9 +94,10 @@ class Workers:
     """Runs jobs that do not touch each other's results, on up to so many threads, the caller's among them."""
 
     def __init__(self, threads: int) -> None:
-        """Start no thread yet; `threads` >= 1."""
-        self.threads = threads
-        self._helpers = ThreadPoolExecutor(threads - 1) if threads > 1 else None  # end when it is forgotten
+        """Start no thread yet; 0 is one for each core."""
+        self.threads = count_threads(threads)
+        several = self.threads > 1
+        self._helpers = ThreadPoolExecutor(self.threads - 1) if several else None  # end when it is forgotten
 
     def close(self) -> None:
         """End the threads now."""
@@ -161,7 +163,6 @@ class Workers:
                     if other is None:
                         waiting[width, k] = own
                         return
-                own, other = (own, other) if k < k ^ width else (other, own)
                 for total, more in zip(own, other, strict=True):
                     np.add(total, more, out=total)
                 k, width = k & ~width, 2 * width
