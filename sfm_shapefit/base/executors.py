@@ -14,7 +14,7 @@ Advance = Callable[[int, int], None]
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
-_RANGES_A_THREAD = 4  # ranges of items for each thread, so that one whose items are slow holds up few
+_RANGES_A_THREAD = 4  # ranges of items for each thread; with one, slow items would hold up the others
 _TASKS_AT_ONCE = 32  # tasks submitted ahead of the answers; bounds the memory that they take
 
 

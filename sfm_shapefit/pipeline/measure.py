@@ -129,7 +129,7 @@ class SideResults:
     """Tracks, errors and counts that each batch adds to."""
 
     def __init__(
-        self, source: MatchSource, threshold_px: float, wanted: MeasureRequest, threads: int
+        self, source: MatchSource, threshold_px: float, wanted: MeasureRequest, threads: int = 1
     ) -> None:
         view, self._threads = source.view, threads
         self._threshold_px, self._num_usable, self._counts_pairs = threshold_px, 0, wanted.facts
