@@ -275,7 +275,8 @@ class IterativeFactor:
 
 def _strengths(system: ReducedSystem, pairs: IntArray) -> FloatArray:
     """Return how strongly pairs are tied, (P,): the norm of their block, unknowns scaled to curvature 1."""
-    scales = np.sqrt(np.maximum(np.einsum("naa->na", system.diagonal), np.finfo(np.float64).tiny))
+    curvatures = np.einsum("naa->na", system.diagonal)
+    scales = np.sqrt(np.where(curvatures > 0.0, curvatures, np.inf))  # what is rounding ties nothing
     scaled = system.pairs / (scales[pairs[:, 0], :, None] * scales[pairs[:, 1], None, :])
     return np.asarray(np.sqrt(np.einsum("kab,kab->k", scaled, scaled)))
 

@@ -5,7 +5,8 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.laplacian.operators import adjacency, group_by
 
-_LARGEST_WEIGHT = 1000  # that METIS is given, which takes whole numbers; finer ones cut no better
+# METIS takes whole weights, and adds all of them up in 32 bits. Finer ones cut no better.
+_LARGEST_WEIGHT, _LARGEST_SUM = 1e3, 2.0**29
 _SEED = 1  # of METIS; the same input gives the same blocks
 
 
@@ -20,7 +21,8 @@ def cut_graph(num_nodes: int, edges: IntArray, weights: FloatArray, size: int) -
     import pymetis
 
     graph = adjacency(num_nodes, edges)
-    whole = 1 + (_LARGEST_WEIGHT * weights / (weights.max() or 1.0)).astype(np.int32)
+    scale = min(_LARGEST_WEIGHT / (weights.max() or 1.0), _LARGEST_SUM / (weights.sum() or 1.0))
+    whole = 1 + (scale * weights).astype(np.int32)
     csr = pymetis.CSRAdjacency(graph.pointers.astype(np.int32), graph.neighbors)
     options = pymetis.Options(seed=_SEED)
     _, parts = pymetis.part_graph(count, csr, eweights=whole[graph.edge_of], options=options)
