@@ -35,7 +35,7 @@ def found(ring_located):
 def counted_at(images, points, apart=NO_PAIRS):
     model, options = read_model(RING / "sparse" / "0"), LocateOptions()
     inputs = choose_inputs(RING / "sparse" / "0", RING / "database.db", "auto")
-    with open_source(model, inputs, options) as source:
+    with open_source(model, inputs) as source:
         view, every, poses = source.view, np.arange(images.num_images), views_of(images).poses(images)
         counted = PartnerCounts(images, view.num_keypoints, options.structure.max_reprojection_error_px)
         is_apart = is_among(view.pairs, apart)
