@@ -25,8 +25,6 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 from typing import Any as _Any
 
-from sfm_shapefit.base.display import write_by as _write_by
-
 if TYPE_CHECKING:
     from sfm_shapefit.adjustment.options import AdjustmentOptions as AdjustmentOptions
     from sfm_shapefit.base.errors import InputError as InputError
@@ -124,7 +122,10 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __version__ = "0.1.0"
 __all__ = list(_HOME_OF)
 
-_write_by(lambda: _import_module("sfm_shapefit.pipeline.write").WRITERS)
+
+def _load_writers() -> _Any:
+    """Return what writes results, for `base.display`, which stands below it."""
+    return _import_module(f"{__name__}.pipeline.write").WRITERS
 
 
 def __getattr__(name: str) -> _Any:

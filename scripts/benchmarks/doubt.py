@@ -146,7 +146,7 @@ def turn_cameras(scene: Scene, repeats: int) -> Row:
 @contextmanager
 def measured(model: ColmapModel, scene: Scene) -> Iterator[tuple[Any, MeasuredPairs]]:
     """Yield the matches of a scene at a model, and what they tell."""
-    with open_source(model, choose_inputs(scene.model, scene.database, "auto"), OPTIONS) as source:
+    with open_source(model, choose_inputs(scene.model, scene.database, "auto")) as source:
         wanted = MeasureRequest(tracks=wants_points(source, OPTIONS.nodes), errors=True)
         yield source, measure(source, OPTIONS.directions, Clock(threads=THREADS), wanted)
 

@@ -6,6 +6,7 @@ Folders and reports are written by a layer above this one, which the package nam
 import html
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -91,12 +92,10 @@ class Writers(NamedTuple):
     """Writes the folder of a result, and returns it."""
 
 
-_loaders: list[Callable[[], Writers]] = []
-
-
-def write_by(load: Callable[[], Writers]) -> None:
-    """Let functions write results that are loaded when the first result is written."""
-    _loaders[:] = [load]
+def _writers() -> Writers:
+    """Return what writes results, by the package's word; it is loaded with the first one that is written."""
+    writers: Writers = import_module(__name__.partition(".")[0])._load_writers()
+    return writers
 
 
 class Reported(Displayed):
@@ -115,7 +114,7 @@ class Reported(Displayed):
         Raises:
             InputError: if the file exists or cannot be written, or the folder has none of the images.
         """
-        return _loaders[0]().page(self, page, images=images, overwrite=overwrite)
+        return _writers().page(self, page, images=images, overwrite=overwrite)
 
 
 class Written(Reported):
@@ -138,7 +137,7 @@ class Written(Reported):
         Raises:
             InputError: if the folder holds something or cannot be written.
         """
-        return _loaders[0]().folder(self, out, **options)
+        return _writers().folder(self, out, **options)
 
 
 def report_in_notebook(found: Any) -> str:
@@ -151,7 +150,7 @@ def report_in_notebook(found: Any) -> str:
     told = ((label, "\n".join(lines)) for label, lines in rows if lines)
     table = _table_rows(told, " style='text-align:left;white-space:pre-line'")
     shown = f"<b style='color:{color}'>{statement}</b><table>{table}</table>"
-    page = _loaders[0]().draw(found)
+    page = _writers().draw(found)
     if len(page) <= _MOST_BYTES:
         shown += (
             f"<iframe sandbox='allow-scripts' style='width:100%;height:{_FRAME_HEIGHT_PX}px;border:0' "

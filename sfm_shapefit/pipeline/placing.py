@@ -1,9 +1,10 @@
 """Place cameras: 3D points and tracks take part where they hold what pairs do not."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from sfm_shapefit.base.arrays import hand_back_memory
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.judgement.verdicts import Hold, find_hold
@@ -27,8 +27,6 @@ from sfm_shapefit.tracks.options import NodeOptions
 
 _FITTING = 0.95  # share of pairs that agree with a placement; from here on no other is tried
 _MOST_TRIED = 5_000  # nodes; more take seconds
-
-PlacesGraph = Callable[..., Iterator[Placement]]
 
 
 def rigs_statement(images: Images, measured: MeasuredGraph) -> str:
@@ -83,56 +81,58 @@ def may_be_checked(measured: MeasuredGraph) -> bool:
     return measured.num_points > 0 and measured.graph.num_nodes <= _MOST_TRIED
 
 
-def place_by_checked(
-    usual: Placement, checked: Callable[[], MeasuredGraph], place: PlacesGraph
-) -> tuple[MeasuredGraph, Placement] | None:
-    """Return the graph with the points of checked tracks, and its placement, if more pairs agree with that.
+class PlacingSetup(NamedTuple):
+    """How the graphs of images are placed."""
 
-    It is tried only where the usual placement leaves pairs over: few pairs need the points of all tracks.
+    images: Images
+    options: PlacementOptions
+    nodes: NodeOptions
+    clock: Clock
+    near: InitialPlacement | None = None
 
-    `checked` makes the same graph with the points of checked tracks, and `place` places one; its first piece
-    counts.
-    """
-    if _count_agreeing(usual) >= _FITTING * usual.num_pairs:
-        return None
-    graph = checked()
-    with suppress(UnsolvableError):
-        other = next(place(graph))
-        if _count_agreeing(other) > _count_agreeing(usual):
-            return graph, other
-    return None
+    def place(self, graph: MeasuredGraph, *, certified: bool = True) -> Iterator[Placement]:
+        """Place the rigid pieces of a graph, see `place_cameras`."""
+        return place_cameras(graph, self.options, self.nodes, self.clock, self.near, certified=certified)
 
 
-def place_measured(
-    images: Images, graph: MeasuredGraph, measured: MeasuredPairs, nodes: NodeOptions, place: PlacesGraph
-) -> list[Placement]:
+def place_measured(setup: PlacingSetup, graph: MeasuredGraph, measured: MeasuredPairs) -> list[Placement]:
     """Return the pieces of a graph, or of that with checked points where more pairs agree with these.
 
     Samples of the errors of directions, which are large, are taken out of what was measured.
     """
     if measured.tracks is None:
-        return list(place(add_evidence(graph, measured)))
+        return list(setup.place(add_evidence(graph, measured)))
     copied = measured if measured.errors is None else replace(measured, errors=list(measured.errors))
-    pieces = list(place(add_evidence(graph, copied)))
-    checked = partial(build_graph, images, measured, nodes, checked=True)
-    better = place_by_checked(pieces[0], checked, partial(place, certified=False))
-    return pieces if better is None else list(place(add_evidence(better[0], measured)))
+    pieces = list(setup.place(add_evidence(graph, copied)))
+    better = _place_by_checked(setup, pieces[0], measured)
+    return pieces if better is None else list(setup.place(add_evidence(better[0], measured)))
 
 
-def place_first(
-    images: Images, rigid: FixedAndRigged, measured: MeasuredPairs, options: PlacingOptions, clock: Clock
-) -> Placement:
+def place_first(setup: PlacingSetup, rigid: FixedAndRigged, measured: MeasuredPairs) -> Placement:
     """Return the largest piece of what was measured, by locations that are only a start."""
-    build = partial(build_graph, images, measured, options.nodes)
-    place = partial(
-        place_cameras, options=options.placement, nodes=options.nodes, clock=clock, certified=False
-    )
-    graph = rigid.apply(build())
-    placement = next(place(graph))
+    graph = rigid.apply(build_graph(setup.images, measured, setup.nodes))
+    placement = next(setup.place(graph, certified=False))
     if measured.checks and may_be_checked(graph):
-        better = place_by_checked(placement, partial(build, checked=True), place)
+        better = _place_by_checked(setup, placement, measured)
         placement = placement if better is None else better[1]
     return placement
+
+
+def _place_by_checked(
+    setup: PlacingSetup, usual: Placement, measured: MeasuredPairs
+) -> tuple[MeasuredGraph, Placement] | None:
+    """Return the graph with the points of checked tracks, and its placement, if more pairs agree with that.
+
+    It is tried only where the usual placement leaves pairs over: few pairs need the points of all tracks.
+    """
+    if _count_agreeing(usual) >= _FITTING * usual.num_pairs:
+        return None
+    graph = build_graph(setup.images, measured, setup.nodes, checked=True)
+    with suppress(UnsolvableError):
+        other = next(setup.place(graph, certified=False))
+        if _count_agreeing(other) > _count_agreeing(usual):
+            return graph, other
+    return None
 
 
 def _count_agreeing(placement: Placement) -> int:

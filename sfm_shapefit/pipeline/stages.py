@@ -15,7 +15,6 @@ scale: nothing that is known of positions says how large it is, and where it sta
 """
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -34,7 +33,7 @@ from sfm_shapefit.pipeline.finish import finish_model
 from sfm_shapefit.pipeline.gauge_choice import bring_to_gauge, bring_to_known
 from sfm_shapefit.pipeline.measure import MeasureRequest, build_graph, measure, wants_points
 from sfm_shapefit.pipeline.memory import count_work, keep_within_memory
-from sfm_shapefit.pipeline.placing import may_be_checked, place_cameras, place_measured
+from sfm_shapefit.pipeline.placing import PlacingSetup, may_be_checked, place_measured
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged
@@ -79,13 +78,13 @@ def place_rigid_pieces(state: ModelState, clock: Clock) -> list[ModelState]:
         work = count_work(state.source, measured.directions, options)
         plan, graph = keep_within_memory(graph, work, options, state.source.memory_plan)
         measured = measured if plan.samples else replace(measured, errors=None)
-        limited, nodes = plan.limit(options.placement), options.nodes
-        place = partial(place_cameras, options=limited, nodes=nodes, clock=clock, near=state.near)
+        limited = plan.limit(options.placement)
+        setup = PlacingSetup(images, limited, options.nodes, clock, state.near)
         if not (measured.checks and may_be_checked(graph)):
             measured = replace(measured, tracks=None)  # which are large
         directions = MeasuredPairs(directions=measured.directions)
         state = replace(state, source=state.source.at(images, plan), measured=directions)
-        placements = place_measured(images, graph, measured, nodes, place)
+        placements = place_measured(setup, graph, measured)
     return [_begin_piece(state, placement) for placement in placements]
 
 

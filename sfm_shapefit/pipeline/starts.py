@@ -33,7 +33,7 @@ from sfm_shapefit.pairs.essential import (
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
 from sfm_shapefit.pipeline.measure import MeasureRequest, measure, wants_points
-from sfm_shapefit.pipeline.placing import place_first
+from sfm_shapefit.pipeline.placing import PlacingSetup, place_first
 from sfm_shapefit.pipeline.relative_rotations import estimate_here
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
@@ -77,7 +77,8 @@ def adjust_first_placement(
         is_free = not state.rigid.has_scale  # offsets do what points do
         wanted = MeasureRequest(tracks=wants_points(source, options.nodes), checked=is_free)
         measured = measure(source, options.directions, clock, wanted)
-        placement = place_first(images, state.rigid, measured, options, clock)
+        setup = PlacingSetup(images, options.placement, options.nodes, clock)
+        placement = place_first(setup, state.rigid, measured)
         directions = replace(measured, tracks=None)
         del measured  # arrays of all pairs
         placed = replace(state, measured=directions, placement=placement).framed()

@@ -311,7 +311,7 @@ def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowh
         kept = far | (found.pairs[:, 1] - found.pairs[:, 0] <= 3)
         return dataclasses.replace(found, rotations=rotations, num_matches=counts).subset(kept)
 
-    monkeypatch.setattr("sfm_shapefit.pipeline.mapping.measure_rotations", with_a_false_loop)
+    monkeypatch.setattr("sfm_shapefit.pipeline.components.measure_rotations", with_a_false_loop)
     found = sfm_shapefit.map_database(database, sequence="names", **FAST)
     (loop,) = found.models[0].loops
     names = found.models[0].averaged_names

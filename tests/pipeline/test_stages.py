@@ -142,9 +142,9 @@ def test_begin_takes_rotations_as_they_are_or_makes_averaged_and_rough_ones_fine
         assert (state.first, state.near) == (None, None)
         assert left_deg.max() > 0.1
         return
-    assert left_deg.max() < 0.02  # keypoints are off by 0.3 px, a fiftieth of a degree
+    assert left_deg.max() < 1e-4  # keypoints are stored as float32
     placed = fit_similarity(state.near.locations, TRUTH.centers).apply(state.near.locations)
-    assert np.abs(placed - TRUTH.centers).max() < 0.01 * np.ptp(TRUTH.centers)
+    assert np.abs(placed - TRUTH.centers).max() < 1e-6 * np.ptp(TRUTH.centers)
 
 
 def test_measured_directions_are_those_of_the_true_cameras():
