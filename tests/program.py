@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from sfm_shapefit.cli import app
 from tests.scenes import ROOT
 
-_PROGRESS = re.compile(rb"^sfm-shapefit: .*[0-9] (?:s|min) so far\n", re.MULTILINE)
+_PROGRESS = re.compile(rb"^sfm-shapefit: (?!compiling).*[0-9] (?:s|min) so far\n", re.MULTILINE)
 """Lines of progress, which say nothing of a command: a machine that is slow or at work has some."""
 
 

@@ -143,7 +143,9 @@ def _refuse_unreadable(order: str, inputs: Sequence[Path | None], has_images: bo
     elif order.startswith("MODEL"):
         *models, database = inputs[:2] if order == "MODEL OUT" else inputs
         for model in filter(None, models):
-            read_source(model, database)
+            read_source(model, database, rotations_suffice=True)
+        if database is not None:
+            DatabaseFile(database).close()
 
 
 @contextmanager

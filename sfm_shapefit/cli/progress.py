@@ -20,17 +20,20 @@ _BAR = 24  # columns; beside it a stage and its counts fit 80
 
 
 class _Course:
-    """The stage that a run is in, how much of it is done, and when both began."""
+    """The stage that a run is in, how much of it is done, when both began, and when the stage may end."""
 
     def __init__(self) -> None:
         self.started = self.began = time.monotonic()
-        self.stage, self.first, self.done, self.total = "start", 0, 0, 1
+        self.stage, self.first, self.done, self.total, self.end = "start", 0, 0, 1, 0.0
 
     def hear(self, stage: str, done: int, total: int) -> None:
         """Take what a stage reports; work done before its first report, as of a resumed run, has no rate."""
+        now = time.monotonic()
         if (stage, total) != (self.stage, self.total):
-            self.began, self.first = time.monotonic(), done
+            self.began, self.first, self.end = now, done, 0.0
         self.stage, self.done, self.total = stage, done, total
+        if done > self.first and now - self.began >= _RATED_S:
+            self.end = now + (now - self.began) * (total - done) / (done - self.first)
 
     @property
     def seconds(self) -> float:
@@ -40,8 +43,7 @@ class _Course:
     @property
     def counts(self) -> str:
         """How much of the stage is done, and how long its rest takes; empty if it does not count."""
-        spent, done = time.monotonic() - self.began, self.done - self.first
-        left = spent * (self.total - self.done) / done if done > 0 and spent >= _RATED_S else 0.0
+        left = self.end - time.monotonic()
         about = f", about {_duration(left)} left" if left >= 1.0 else ""
         return f"{self.done:,} of {self.total:,}{about}" if self.total > 1 else ""
 
@@ -114,9 +116,9 @@ def _one_line() -> "Iterator[Progress]":
     course = _Course()
 
     def draw() -> Table:
-        line = Table.grid(*[""] * 4, padding=(0, 1))
-        for column in line.columns:
-            column.no_wrap = True
+        line = Table.grid(padding=(0, 1))
+        for is_bar in (False, True, False, False):  # the bar is what becomes shorter where there is no room
+            line.add_column(no_wrap=not is_bar)
         bar = ProgressBar(course.total, course.done, width=_BAR, pulse=course.total <= 1)
         line.add_row(course.stage, bar, course.counts, f"({_duration(course.seconds)} so far)")
         return line

@@ -144,6 +144,7 @@ def test_what_is_wrong_with_the_input_is_said_before_what_is_wrong_with_the_outp
         ("map empty out", "empty is a folder without a database.db that holds no image"),
         ("locate nosuch out", "nosuch does not exist"),
         (f"locate {RING_MODEL} out --priors nosuch.csv", "nosuch.csv does not exist"),
+        (f"locate {RING_MODEL} out --database words.db", "words.db is not a COLMAP database"),
         (f"join {RING_MODEL} nosuch out", "nosuch does not exist"),
         (f"join {RING_MODEL} empty out", "empty holds no COLMAP model"),
         ("place nosuch.txt out", "nosuch.txt does not exist"),
