@@ -171,6 +171,7 @@ class Row:
         pixels = [100.0 * ((x - c)[:, :2] / x[:, 2:]) for c, x in zip(centers, [first] * 4, strict=True)]
         for k in (2, 3):
             pixels[k][same:] = 100.0 * (second - centers[k])[:, :2] / second[:, 2:]
+        pixels = [np.vstack([one, np.full((5, 2), 1e3)]) for one in pixels]
         lens = Lens("SIMPLE_PINHOLE", (100.0, 0.0, 0.0))
         self.images = SimpleNamespace(
             num_images=4,
@@ -181,13 +182,14 @@ class Row:
             lens_of=np.zeros(4, dtype=int),
         )
         self.pictures = SimpleNamespace(
-            count=lambda _: n,
+            count=lambda _: n + 5,
             pixels=lambda k, keypoints: pixels[k][keypoints],
             project=lambda _k, x, **_: 100.0 * x[:, :2] / x[:, 2:],
         )
-        self.num_keypoints, self.is_same = np.full(4, n), np.arange(len(seen)) < same
-        own = np.tile(np.arange(n)[:, None], 2)
-        self.matches = KeypointMatches(pairs=np.array([[1, 2]]), offsets=np.array([0, n]), keypoints=own)
+        self.num_keypoints, self.is_same = np.full(4, n + 5), np.arange(len(seen)) < same
+        # Five matches have a point at one end only, and say nothing.
+        own = np.column_stack([[*range(n), *range(5)], [*range(n), *range(n, n + 5)]])
+        self.matches = KeypointMatches(pairs=np.array([[1, 2]]), offsets=np.array([0, n + 5]), keypoints=own)
 
     def lost(self, group=(0, 0, 1, 1), pictures=None, also=()):
         view = SimpleNamespace(
