@@ -1,9 +1,6 @@
 """`warm-up`: everything is compiled beforehand, by several processes, and nothing afterwards."""
 
 import inspect as python_inspect
-import re
-import os
-from multiprocessing import Pipe
 
 import pytest
 from numba.core import config
