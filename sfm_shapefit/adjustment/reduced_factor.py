@@ -34,7 +34,7 @@ from sfm_shapefit.laplacian.factor import Factor, FactorPlan, allocate_factor, a
 from sfm_shapefit.laplacian.operators import Workers
 
 _DENSE_LIMIT, _SPARSE_LIMIT = 3000, 12_000  # unknowns: 500 and 2,000 free cameras
-_NODES_AT_ONCE = 32  # nodes whose columns of the inverse are solved for together, as one job of a thread
+_NODES_AT_ONCE = 32  # nodes whose columns of the inverse are one job; BLAS is slow on fewer columns
 # Residual of a solve, relative to its right-hand side, and products that may lead there; a factor of 64 bits
 # takes as long as 25 to 40 of them.
 _RESIDUAL, _MOST_PRODUCTS = 1e-11, 40
@@ -152,7 +152,7 @@ class DenseFactor:
         if not len(unknown):
             return
         first = int(own[unknown[0]])
-        columns = np.zeros((size - first, len(own)))  # of L^-1, by rows from the first that is not zero
+        columns = np.zeros((size - first, len(own)))  # columns of L^-1 without the rows above, which are zero
         columns[own[unknown] - first, unknown] = 1.0
         triangle = self.matrix.ctypes.data + first * (size + 1) * self.matrix.itemsize, size
         shape = len(own), size - first

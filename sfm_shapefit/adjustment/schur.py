@@ -20,8 +20,8 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.jit import kernel, subtract_block
 from sfm_shapefit.laplacian.operators import Workers
 
-_ENTRIES_WORTH_A_THREAD = 1_000  # each meets all others of its point
-_ENTRIES_OF_POINTS_WORTH_A_THREAD = 50_000  # each is multiplied by a step
+_ENTRIES_WORTH_A_THREAD = 1_000  # entries; each meets all others of its point, which takes long
+_ENTRIES_OF_POINTS_WORTH_A_THREAD = 50_000  # entries; each is only multiplied by a step
 _SINGULAR = 1e-12  # least pivot of a point's block, relative to its diagonal: a parallax of 1e-6 rad
 
 

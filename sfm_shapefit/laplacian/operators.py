@@ -87,7 +87,7 @@ def even_ranges(starts: IntArray, count: int) -> list[tuple[int, int]]:
     return list(zip([0, *cuts], [*cuts, len(starts) - 1], strict=True))
 
 
-_RANGES = 4  # ranges of rows for each thread, which then end together
+_RANGES = 4  # ranges of rows for each thread; with fewer, some threads end long before the others
 
 
 class Workers:
