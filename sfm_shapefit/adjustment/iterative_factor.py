@@ -42,8 +42,7 @@ from sfm_shapefit.laplacian.operators import Workers
 UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"
 """What is said of a system that is singular."""
 
-# Nodes of a block, and the share of them by which it grows: as prototypes had them, whose counts of iterations
-# hardly depended on either.
+# Nodes of a block, and the share of them by which it grows; the counts of iterations hardly depend on them.
 _BLOCK, _OVERLAP = 150, 0.15
 _GROUP = 12  # frames of a group; with thrice as many, iterations are a third more
 _GROUPS_OF_A_NODE = 4  # groups whose similarities a frame weighs at most; the others weigh next to nothing

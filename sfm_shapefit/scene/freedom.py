@@ -17,7 +17,7 @@ PARTS_FREED: dict[IntrinsicsFreedom, tuple[str, ...]] = {
 }
 """What each choice frees of a lens, see `scene.lens.PARTS`."""
 
-# Cameras. To adjust 2,500 takes 1.7 times as long as all the rest, and twice the memory; where rotations
+# Cameras. To adjust 2,500 takes twice as long as all the rest, and twice the memory; where rotations
 # are .05 degrees off, it leaves a fifth of the errors. More than these were not tried.
 _MOST_ADJUSTED_CAMERAS = 5_000
 
