@@ -50,7 +50,7 @@ class AdjustmentOptions(Settings):
         "auto",
         "How the system of the cameras is solved: by a dense factor of LAPACK, a sparse one in blocks, or by "
         "conjugate gradients with blocks and a coarse system; auto is dense up to 3,000 unknowns (500 "
-        "cameras), sparse up to 12,000 (2,000), and iterative beyond. Covariances take a factor.",
+        "cameras), and sparse beyond. Covariances always take a factor.",
     )
     threads: int = option(1, "Threads that share the work; the answer is the same whatever their number.")
 
