@@ -42,11 +42,12 @@ from sfm_shapefit.laplacian.operators import Workers
 UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"
 """What is said of a system that is singular."""
 
-_BLOCK, _OVERLAP = 150, 0.15  # nodes of a block, and the share of them by which it grows
-_GROUP = 12  # frames of a group
-_GROUPS_OF_A_NODE = 4  # groups whose similarities a frame weighs at most, those of largest weight
-_OWN_SHARE = 0.2  # weight of a frame's own group, over that of all its neighbors
-_SIMILARITY = 7  # unknowns of a group
+# Nodes of a block, and the share of them by which it grows; the counts of iterations hardly depend on them.
+_BLOCK, _OVERLAP = 150, 0.15
+_GROUP = 12  # frames of a group; with thrice as many, iterations are a third more
+_GROUPS_OF_A_NODE = 4  # groups whose similarities a frame weighs at most; the others weigh next to nothing
+_OWN_SHARE = 0.2  # weight of a frame's own group, over that of its neighbors; they make it smooth
+_SIMILARITY = 7  # unknowns of a group; three shifts, three turns, one scaling
 # Shares of the diagonal that are added to it, in turn until there is a factor: of 32 bits for a block, as its
 # rounding only costs iterations, and of 64 for the coarse system, where the least motions are.
 _RIDGES_OF_BLOCKS, _RIDGES_OF_COARSE = (1e-7, 1e-5, 1e-3, 1e-1), (1e-13, 1e-11, 1e-9, 1e-7)
@@ -286,10 +287,9 @@ def _group_frames(num_frames: int, ties: IntArray, strengths: FloatArray) -> tup
     group_of = cut_graph(num_frames, ties, strengths, _GROUP)
     ends, others = np.concatenate([ties, ties[:, ::-1]]).T
     sums = np.bincount(ends, np.tile(strengths, 2), num_frames)
-    own = np.where(sums > 0.0, _OWN_SHARE * sums, 1.0)
     keys = np.concatenate([ends, np.arange(num_frames)]) * num_frames
     keys, rows = np.unique(keys + group_of[np.append(others, np.arange(num_frames))], return_inverse=True)
-    weights = np.bincount(rows, np.concatenate([np.tile(strengths, 2), own]))
+    weights = np.bincount(rows, np.concatenate([np.tile(strengths, 2), _OWN_SHARE * sums]))
     frames, groups = np.divmod(keys, num_frames)
     ranks = rank_within(frames, -weights, groups)
     largest = ranks < _GROUPS_OF_A_NODE
@@ -297,7 +297,7 @@ def _group_frames(num_frames: int, ties: IntArray, strengths: FloatArray) -> tup
     found = np.zeros((num_frames, _GROUPS_OF_A_NODE), dtype=np.int64)
     shares = np.zeros(found.shape)
     found[places], shares[places] = groups[largest], weights[largest]
-    return found, shares / shares.sum(axis=1, keepdims=True)
+    return found, shares / np.where(sums > 0.0, shares.sum(axis=1), 1.0)[:, None]  # what nothing ties stays
 
 
 def _pairs_of_groups(groups: IntArray, weights: FloatArray, pairs: IntArray, count: int) -> IntArray:

@@ -51,7 +51,7 @@ class AdjustmentOptions(Settings):
         "auto",
         "How the system of the cameras is solved: by one dense factor, a sparse one in blocks, or by "
         "conjugate gradients with blocks and a coarse system; auto is dense up to 3,000 unknowns (500 "
-        "cameras), sparse up to 12,000 (2,000), and iterative beyond. Covariances take a factor.",
+        "cameras), and sparse beyond. Covariances always take a factor.",
     )
     threads: int = option(
         0, f"Threads to use, at most {MAX_THREADS}, or 0 for one per core. The answer does not depend on it."

@@ -1,6 +1,6 @@
 """The reduced system factored: as one dense matrix, or sparse by the block Cholesky of `laplacian`.
 
-Steps of still more unknowns are solved without such a factor, see `iterative_factor`.
+Steps may be solved without a factor of the whole, see `iterative_factor`.
 
 Unknowns that no node has are left out of the dense matrix; in the sparse one they are rows of the identity,
 and blocks are only as large as the largest node (3 where rotations are held).
@@ -33,7 +33,7 @@ from sfm_shapefit.laplacian.dense import PIVOT_TOLERANCE, blas_of, trsm
 from sfm_shapefit.laplacian.factor import Factor, FactorPlan, allocate_factor, analyze
 from sfm_shapefit.laplacian.operators import Workers
 
-_DENSE_LIMIT, _SPARSE_LIMIT = 3000, 12_000  # unknowns: 500 and 2,000 free cameras
+_DENSE_LIMIT = 3000  # unknowns: 500 free cameras
 _NODES_AT_ONCE = 32  # nodes whose columns of the inverse are one job; BLAS is slow on fewer columns
 # Residual of a solve, relative to its right-hand side, and products that may lead there; a factor of 64 bits
 # takes as long as 25 to 40 of them.
@@ -81,8 +81,7 @@ def choose_solver(
     """Return what the systems of steps are solved with, as the options ask."""
     if _is_dense(layout, options):
         return DenseFactor.plan(layout, options.threads)
-    is_large = options.linear_solver == "auto" and layout.num_unknowns > _SPARSE_LIMIT
-    if is_large or options.linear_solver == "iterative":
+    if options.linear_solver == "iterative":
         return IterativeFactor(problem, layout, workers)
     return SparseFactor.of(layout, options.threads, np.float32)
 

@@ -7,7 +7,7 @@ from sfm_shapefit.laplacian.operators import adjacency, group_by
 
 # METIS takes whole weights, and adds all of them up in 32 bits. Finer ones cut no better.
 _LARGEST_WEIGHT, _LARGEST_SUM = 1e3, 2.0**29
-_SEED = 1  # of METIS; the same input gives the same blocks
+_SEED = 1  # seed of METIS; the same input gives the same blocks
 
 
 def cut_graph(num_nodes: int, edges: IntArray, weights: FloatArray, size: int) -> IntArray:

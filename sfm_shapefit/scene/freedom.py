@@ -17,9 +17,7 @@ PARTS_FREED: dict[IntrinsicsFreedom, tuple[str, ...]] = {
 }
 """What each choice frees of a lens, see `scene.lens.PARTS`."""
 
-# Cameras. To adjust 2,500 takes 1.7 times as long as all the rest, and twice the memory; where rotations
-# are .05 degrees off, it leaves a fifth of the errors. More than these were not tried.
-_MOST_ADJUSTED_CAMERAS = 5_000
+_MOST_ADJUSTED_CAMERAS = 2_000  # cameras; the adjustment of more would take longer than all the rest
 
 
 @explained
@@ -30,7 +28,7 @@ class FreedomOptions(Settings):
     adjust: Adjust = option(
         "seed",
         'Whether poses and points are bundle adjusted once ("seed"), twice ("full") or not ("none"): first '
-        "by all tracks, with rotations as far as they are in doubt (up to 5,000 cameras); then all freely.",
+        "by all tracks, with rotations as far as they are in doubt (up to 2,000 cameras); then all freely.",
     )
     intrinsics: IntrinsicsFreedom = option(
         "auto",
