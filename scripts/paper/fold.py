@@ -50,7 +50,7 @@ def _models() -> Iterator[tuple[str, pycolmap.Reconstruction | sfm_shapefit.Loca
         yield "COLMAP", pycolmap.incremental_mapping(database, name, Path(name, "1"), incremental)[0]
         globally = pycolmap.GlobalPipelineOptions(**same)
         yield "GLOMAP", pycolmap.global_mapping(database, name, Path(name, "2"), globally)[0]
-        yield "`map`", sfm_shapefit.map_database(database).models[0].located
+        yield "`map`", sfm_shapefit.map_database(database).models[0]
 
 
 def _draw(
