@@ -299,7 +299,8 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     start.camera(1).params = np.array([400.5, 320.0, 240.0, 0.0, 0.0])
     images, links = posed_images(start), links_of(start, tracks)
     known = images.with_lenses([in_doubt(lens, focal_sigma=2e-3) for lens in images.lenses])
-    held = adjust_thinly(known, lambda: links, StructureOptions(), Freedom(**free), lenses_wanted=True)
+    run = adjustment_run.begin(known, links, StructureOptions(), Freedom(**free))
+    held = adjust_thinly(run, lenses_wanted=True)
     assert held.undetermined.all()  # the matches know it no better than it was given
     assert held.freedom.parts.tolist() == [[False, True]]
     assert not held.is_refined.any()
@@ -315,7 +316,7 @@ def test_a_placement_is_adjusted_though_its_only_lens_in_doubt_is_left_open():
     images, links = posed_images(start), links_of(start, matches_of(scene("PINHOLE")))
     known = images.with_lenses([in_doubt(lens, focal_sigma=1e-4) for lens in images.lenses])
     free = Freedom(parts=np.ones(2, bool))
-    found = adjust_placement(known, links, StructureOptions(), free, GivenPoses())
+    found = adjust_placement(adjustment_run.begin(known, links, StructureOptions(), free))
     assert found.undetermined.all()
     assert [lens.parameters for lens in found.images.lenses] == [lens.parameters for lens in images.lenses]
 
