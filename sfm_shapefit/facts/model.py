@@ -18,7 +18,6 @@ from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
-from sfm_shapefit.facts.evidence import ToldEvidence, ToldOpinion
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics, describe_intrinsics
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.placed import (
@@ -35,7 +34,9 @@ from sfm_shapefit.facts.placed import (
 from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
 from sfm_shapefit.facts.scene import DistanceFacts, Loop, describe_line, describe_loops
 from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, Kind
+from sfm_shapefit.judgement.second_opinion import SecondOpinion
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.placement.place import Placement
 
@@ -212,7 +213,7 @@ class FactsOfModel(Facts):
         float | None, "Mean reprojection error of these points; null if there are none."
     ]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
-    evidence: Annotated[ToldEvidence, "What speaks against the model although it fits."] = ToldEvidence()
+    evidence: Annotated[ModelEvidence, "What speaks against the model although it fits."] = ModelEvidence()
 
     def told_lines(self, against: tuple[int, int], more: str = "") -> list[str]:
         """Return the answer in lines: how many pairs are `against` it, of how many, and `more` of matches."""
@@ -412,7 +413,7 @@ class CheckedFacts(FactsOfModel):
         text = "Next: check it against its photographs, or the database that it was made from (--database)."
         return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")
 
-    def _next_of_map(self, second: ToldOpinion) -> NextStep:
+    def _next_of_map(self, second: SecondOpinion) -> NextStep:
         """Return how to take the model that `map` makes of the database: the one that was kept, or anew."""
         why = "; pairs support it" if second.wrong else ""
         if self.second_opinion:

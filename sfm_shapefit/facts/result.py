@@ -15,7 +15,6 @@ from sfm_shapefit.base.display import Telling, Written, report_in_notebook
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.control_points import ControlPoint
-from sfm_shapefit.facts.evidence import ToldEvidence, tell_evidence
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.model import (
@@ -219,7 +218,7 @@ class LocateResult(_Placed):
     observations: ObservationShares
     """Shares of keypoints that agree and contradict; NaN where there is no database."""
     evidence: ModelEvidence = field(default_factory=ModelEvidence)
-    """What speaks against it although it fits, by images of it."""
+    """What speaks against it although it fits."""
 
     intrinsics: RefinedIntrinsics
     """What became of the lenses that were in doubt."""
@@ -284,7 +283,6 @@ class LocateResult(_Placed):
             datum=EarthDatum.of(gauge.datum),
             rigid_groups=GroupFacts.of_placement(placement, self.kept, self.fixed),
             intrinsics=tuple(self.intrinsics.rows(self.placed)),
-            evidence=self.told_evidence,
             refined_rigs=self.rigs,
             num_doubtful_pairs=len(self.doubtful_pairs),
             adjustment=PlacementAdjustment.of_estimate(self.adjustment),
@@ -296,11 +294,6 @@ class LocateResult(_Placed):
     def _headline(self) -> str:
         images = f"{self.model.num_reg_images()} of {len(self.image_names)} images placed"
         return f"{self.verdict.grade.value}: {images}, {counted(self.model.num_points3D(), 'point')}"
-
-    @property
-    def told_evidence(self) -> ToldEvidence:
-        """What speaks against it although it fits, by name."""
-        return tell_evidence(self.evidence, self.placed, self.gauge.similarity.scale, self.gauge.axes)
 
     @property
     def delivered(self) -> Delivered:

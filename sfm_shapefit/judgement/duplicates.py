@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.judgement.evidence import Oddity
+from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import FEW, FEWEST_POINTS, HALF, RARE
 from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.pairs.pair_directions import PairDirections
@@ -23,7 +23,7 @@ from sfm_shapefit.scene.points import Points
 
 def find_split_duplicates(
     images: Images, points: Points, pictures: Pictures, directions: PairDirections, view: View
-) -> Iterator[Oddity]:
+) -> Iterator[OddImages]:
     """Yield the images that have a near duplicate which stands half the distance to their points away.
 
     The `directions` are of pairs of the view, some of which have none.
@@ -38,7 +38,7 @@ def find_split_duplicates(
     np.maximum.at(most, pairs[split], apart[split, None])
     if len(named := np.flatnonzero(most)):
         sentence = "a near duplicate that stands {} times the distance to its points away"
-        yield Oddity(Kind.PLACE, False, named, most[named], sentence)
+        yield OddImages.of_values(Kind.PLACE, images.names_of(named), most[named], sentence)
 
 
 def _depths(images: Images, points: Points) -> FloatArray:

@@ -29,16 +29,16 @@ from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
-from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
+from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
 from sfm_shapefit.judgement.reasons import (
     ARE_ITS_PICTURES,
     IS_ITS_DATABASE,
@@ -50,7 +50,7 @@ from sfm_shapefit.judgement.reasons import (
     of_model,
 )
 from sfm_shapefit.judgement.resolutions import recognize_resolution
-from sfm_shapefit.judgement.second_opinion import compare_models
+from sfm_shapefit.judgement.second_opinion import SecondOpinion, compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.clock import Clock
@@ -149,7 +149,8 @@ def check_source(
         weak = list(_find_weak(model.images, quality))
         second = None if fits is None or other is None else _compare(matches, fits, structure, other)
         if fits is not None and second is not None:
-            evidence = evidence.beside(second, fits.sides[1])
+            names, (_, against) = model.images.names, fits.sides
+            evidence = evidence.beside(second, [(names[i], names[j]) for i, j in against.tolist()])
     reasons = list(_reasons(model, structure, weak, fits, evidence, matches))
     verdict = ModelVerdict.weigh(reasons)
     if verdict.is_bad and (far := matches.inputs.far):
@@ -161,10 +162,9 @@ def check_source(
     verdict = verdict.led_by(recognized and of_model(Kind.INPUT, recognized.sentence))
     more = (one for one in reasons if one.of_each and one not in weak and one.kind is not Kind.SECOND_OPINION)
     cameras = _tell_cameras(model, pairs, [*weak, *more])
-    told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, cameras, pairs, quality)
     facts |= {"verdict": verdict, "residual_level_deg": level_deg, "timings_s": clock.seconds}
-    facts |= {"evidence": told, "warnings": [*model.notes, *matches.matches.notes, *told.statements]}
+    facts |= {"evidence": evidence, "warnings": [*model.notes, *matches.matches.notes, *evidence.statements]}
     return CheckResult(
         model=model,
         cameras=cameras,
@@ -193,12 +193,12 @@ def _compare(
     if second is None:
         return None
     grade = other.source.models[other.number].located.verdict.grade
-    second = second._replace(grade=grade, folder=str(other.number))
+    second = replace(second, grade=grade, folder=str(other.number))
     elsewhere = [*second.wrong, *second.undecided]
     if len(elsewhere) != 1:  # several that are wrong together see false points together
         return second
-    sure = ask_pixels(matches, structure, np.isin(np.arange(images.num_images), elsewhere))
-    return second._replace(wrong=second.wrong[:0], undecided=second.undecided[:0]) if sure.any() else second
+    is_confirmed = ask_pixels(matches, structure, elsewhere)
+    return replace(second, wrong=(), undecided=()) if is_confirmed else second
 
 
 def _tell_pairs(images: Images, fits: PairFits) -> list[PairRow]:
@@ -281,9 +281,7 @@ def _reasons(
     yield from against
     if fits is not None and not any(one.grade is Grade.DO_NOT_USE for one in against):
         yield from _none_agrees(fits, matches)
-    confirmed = [] if evidence.second is None else evidence.second.confirmed.tolist()
-    right = {model.images.names[k] for k in confirmed}
-    yield from (one for one in weak if not right.issuperset(one.images))
+    yield from (one for one in weak if not evidence.opinion.confirmed.issuperset(one.images))
     if pointless:
         clause = "it has no 3D points, so that only matches say where its cameras stand"
         yield of_model(Kind.POINTS, clause)

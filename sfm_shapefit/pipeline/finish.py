@@ -96,7 +96,7 @@ def _compare_with_priors(state: ModelState) -> PriorFit | None:
 def _warnings(found: LocateResult, state: ModelState) -> Iterator[str]:
     """Yield what the user should know of a finished piece beyond the tables: what speaks against it first."""
     images, options, gauge = found.placed, found.options, found.gauge
-    yield from found.told_evidence.statements
+    yield from found.evidence.statements
     yield from intrinsics_warnings(found.intrinsics.rows(images))
     yield from match_warnings(state.directions, may_repeat=state.source.has_database)
     yield from quality_warnings(found.placement, options.placement)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.evidence import AmbiguousPlace, GroupApart, ToldEvidence, ToldOpinion
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics
 from sfm_shapefit.facts.model import BundleAdjustment
 from sfm_shapefit.facts.placed import IN_MEMORY, KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.report import thumbnails
 from sfm_shapefit.report.charts import (
@@ -31,6 +31,7 @@ from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
 from sfm_shapefit.report.sentences import first_looks, shorten, summary_sentences
 from sfm_shapefit.report.thumbnails import read_thumbnails
 from tests.drawings import make_drawing
+from tests.judgement.made import group_apart, opinion_with, place_of
 
 HOSTILE = [
     "<script>document.title='owned'</script>.jpg",
@@ -176,22 +177,12 @@ def doubted():
     drawing, facts = make_drawing()
     names = drawing.cameras.names
 
-    def apart(rows):
-        images = tuple(names[k] for k in rows)
-        return GroupApart(images=images, num_agreeing=1, num_contradicting=9, num_turned=0, turn_deg=None)
+    def apart(*rows):
+        return group_apart(*(names[k] for k in rows))
 
-    place = AmbiguousPlace(image=names[9], num_here=2, num_there=5, offset=(1.0, 2.0, -0.5))
-    second = ToldOpinion(
-        num_common=25,
-        usual=1e-3,
-        wrong=(names[4], names[12]),
-        undecided=(),
-        num_for=0,
-        num_against=9,
-        ambiguous=(),
-        has_nothing_in_common=False,
-    )
-    evidence = ToldEvidence(places=(place,), seams=(apart([4, 5]), apart([3, 4, 5, 6])), second=second)
+    place = replace(place_of(names[9], 2, 5), offset=(1.0, 2.0, -0.5))
+    second = opinion_with(wrong=(names[4], names[12]))
+    evidence = ModelEvidence(places=(place,), seams=(apart(4, 5), apart(3, 4, 5, 6)), second=second)
     return drawing, replace(facts, evidence=evidence, warnings=evidence.statements)
 
 
