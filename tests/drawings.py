@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.facts.model import EvidenceShares, ModelFacts, ModelInputs
-from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece, Solve
+from sfm_shapefit.facts.model import ModelFacts, ModelInputs
+from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
+from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.report.drawing import Poses, build_drawing
+from sfm_shapefit.solver.options import Solve
 
 UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7
 

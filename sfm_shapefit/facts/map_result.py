@@ -16,7 +16,6 @@ from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.model import (
-    Averaging,
     Component,
     DatabaseInputs,
     JoinedFacts,
@@ -163,7 +162,7 @@ class MapResult(Written):
                     folder=str(number),
                     num_images=len(model.names),
                     num_placed=int(model.located.kept.sum()),
-                    averaging=Averaging(**model.averaging.summary()),
+                    averaging=model.averaging.facts,
                     located=model.located.facts,
                 )
                 for number, model in enumerate(self.models)

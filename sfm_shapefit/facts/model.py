@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 
-from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.estimate import BundleAdjustment, Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
@@ -32,21 +32,18 @@ from sfm_shapefit.facts.placed import (
     Warnings,
 )
 from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
-from sfm_shapefit.facts.scene import DistanceFacts, Loop, describe_line, describe_loops
+from sfm_shapefit.facts.scene import DistanceFacts, describe_line, describe_loops
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.second_opinion import SecondOpinion
+from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.placement.place import Placement
-
-
-class EarthDatum(Record):
-    """A point on the WGS84 ellipsoid: the origin of axes east, north and up, in meters."""
-
-    latitude_deg: Annotated[float, "Geodetic latitude."]
-    longitude_deg: Annotated[float, "Longitude, east of Greenwich."]
-    altitude_m: Annotated[float, "Height above the ellipsoid, or what the priors give for it."]
+from sfm_shapefit.rotations.averaged import Averaging
+from sfm_shapefit.rotations.sequences import Loop
+from sfm_shapefit.scene.given import EarthDatum
+from sfm_shapefit.scene.lens import LensErrors
 
 
 class ModelInputs(InputFacts):
@@ -65,25 +62,6 @@ class ModelInputs(InputFacts):
     def database_flag(self) -> str:
         """How a command is given the database, after a space; empty without one."""
         return f" --database {shlex.quote(_from_here(self.database))}" if self.database else ""
-
-
-class EvidenceShares(Record):
-    """What share of the evidence agrees with the cameras and points of the output."""
-
-    pairs: Annotated[
-        float | None,
-        "Share of the pairs of its cameras that say anything of a direction; null where none does.",
-    ]
-    observations: Annotated[
-        float | None,
-        "Share that sees a 3D point, of the keypoints matched in two or more of its other images; null "
-        "without a database.",
-    ]
-    contradicting: Annotated[
-        float | None,
-        "Share that sees none and most of whose matches miss the epipolar lines of the cameras, of the "
-        "same keypoints.",
-    ]
 
 
 class PlacementAdjustment(Record):
@@ -111,18 +89,6 @@ class PlacementAdjustment(Record):
             rotation_sigma_deg=None if held or free else math.degrees(sigma_rad),
             chance_deg=None if errors is None else math.degrees(errors.chance_rad),
         )
-
-
-class LensErrorFacts(Record):
-    """What the standard deviations take smooth errors of the lenses for, by what the residuals say."""
-
-    score: Annotated[
-        float,
-        "Standard score of errors that all images of a lens share, the largest; up to 3 they are noise, "
-        "from 4 on they count in full.",
-    ]
-    own_px: Annotated[float, "Errors of an image of its own, root of the mean square in pixels; 0 if none."]
-    shared_px: Annotated[float, "The same of errors that all images of a lens share."]
 
 
 class RotationRefinement(Record):
@@ -153,22 +119,6 @@ class RotationRefinement(Record):
             median_change_deg=float(np.median(changed)) if len(changed) else 0.0,
             max_change_deg=float(changed.max(initial=0.0)),
         )
-
-
-class BundleAdjustment(Record):
-    """What --adjust full reached; mean reprojection errors."""
-
-    converged: Annotated[bool, "Whether the last round met its tolerance."]
-    iterations: Annotated[int, "Steps of all rounds together."]
-    initial_error_px: Annotated[float, "At the seed's poses."]
-    final_error_px: Annotated[float, "At the adjusted poses."]
-
-    @property
-    def statement(self) -> str:
-        """How it went, in words."""
-        state = "converged" if self.converged else "stopped at its limit"
-        errors = f"{self.initial_error_px:.2f} -> {self.final_error_px:.2f} px"
-        return f"{state} after {self.iterations} steps, mean error {errors}"
 
 
 class GroupFacts(Record):
@@ -280,7 +230,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     loops: Annotated[tuple[Loop, ...], "Loops of the videos among the images of `map`."]
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
     lens_errors: Annotated[
-        LensErrorFacts | None, "Null where the standard deviations know of matching noise only."
+        LensErrors | None, "Null where the standard deviations know of matching noise only."
     ]
     rotation_refinement: Annotated[RotationRefinement | None, "Null if nothing was adjusted."]
     bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
@@ -471,26 +421,6 @@ class DatabaseInputs(Record):
     """What `map` worked from."""
 
     database: Annotated[str, "The database's path."]
-
-
-class Averaging(Record):
-    """How rotations were averaged, and how well they agree with the pairs."""
-
-    statement: Annotated[str, "How the rotations were found, in words."]
-    num_registered: Annotated[int, "Images that have a rotation."]
-    num_pairs: Annotated[int, "Pairs whose residuals count."]
-    agreeing_share: Annotated[float, "Share of the pairs, by the square root of their matches, that agree."]
-    num_unsettled: Annotated[int, "Images that most of their pairs contradict, in every answer tried."]
-    median_sigma_deg: Annotated[float | None, "Median standard deviation of a rotation; null if not known."]
-    num_tried: Annotated[int, "Averagings of which this one is the most consistent."]
-    certified: Annotated[
-        bool | None, "Whether no rotations fit the kept pairs better; null if that was not checked."
-    ]
-    num_repeated_pairs: Annotated[
-        int,
-        "Pairs set aside since they would fold the images together, and lack matches that they should share.",
-    ]
-    num_rival_pairs: Annotated[int, "Pairs of another arrangement of the images that is as likely."]
 
 
 class Component(Record):

@@ -25,7 +25,7 @@ from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.placement.place import Placement, count_large
 from sfm_shapefit.refinement.starts import RefinedPlacement
-from sfm_shapefit.solver.options import Status
+from sfm_shapefit.solver.options import Solve, Status
 
 UNITS = {
     "input": "of the input's units",
@@ -221,23 +221,6 @@ class Delivered(Record):
         )
 
 
-class Solve(Record):
-    """A certified ShapeFit solve: of the largest piece, or over pieces that are joined."""
-
-    status: Annotated[str, "converged, inaccurate, max_iterations or cancelled."]
-    objective: Annotated[float | None, "R(T) / L(T) of the paper at the ShapeFit optimum, dimensionless."]
-    dual_bound: Annotated[float | None, "No placement has a lower objective."]
-    gap: Annotated[float | None, "objective - dual_bound."]
-    equality_residual: Annotated[
-        float | None, "Violation of the dual's equality, relative to the largest weighted degree."
-    ]
-    unique: Annotated[bool | None, "Whether the certificate proves the optimum unique; null if not examined."]
-    iterations: Annotated[int, "Iterations of the solver that ran."]
-    seconds: Annotated[float, "Wall-clock time of the solve."]
-    method: Annotated[str, "The solver that ran."]
-    method_reason: Annotated[str, "Why it was chosen."]
-
-
 class Lud(Record):
     """The LUD start and its own dual bound, in its own units."""
 
@@ -285,7 +268,7 @@ class Finish(Record):
             moved_max=refined.moved[1],
             num_put_back=len(refined.reset_nodes),
             lud=Lud.of(refined.lud),
-            reweighted=refined.reweighted and Solve(**refined.reweighted.solved.summary()),
+            reweighted=refined.reweighted and refined.reweighted.solved.facts,
         )
 
 
@@ -393,7 +376,7 @@ def facts_of_placement(
             for group in placement.assessment.loose_groups
         ],
         "pieces": pieces_of(placement, solved),
-        "solve": Solve(**placement.certified.summary()),
+        "solve": placement.certified.facts,
         "finish": Finish.of_placement(placement.refined),
         "versions": {"sfm_shapefit": __version__} | {name: version(name) for name in others},
     }

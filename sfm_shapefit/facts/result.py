@@ -18,11 +18,7 @@ from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.model import (
-    BundleAdjustment,
-    EarthDatum,
-    EvidenceShares,
     GroupFacts,
-    LensErrorFacts,
     ModelFacts,
     ModelInputs,
     PlacementAdjustment,
@@ -36,14 +32,13 @@ from sfm_shapefit.facts.placed import (
     Delivered,
     GraphFacts,
     GraphInputs,
-    Solve,
     TakenForRight,
     facts_of_placement,
 )
 from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
-from sfm_shapefit.facts.scene import Loop, told_distances
+from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -57,7 +52,7 @@ from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.straight import find_line, sigma_along
-from sfm_shapefit.judgement.support import ObservationShares
+from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
@@ -66,6 +61,7 @@ from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.placement.right_pairs import RightPairs, examine_right_pairs
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.rotations.sequences import Loop
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
 from sfm_shapefit.solver.options import SolverResult
@@ -215,8 +211,8 @@ class LocateResult(_Placed):
     unsupported: BoolArray
     """(n,) images hardly any of whose matches makes a point with a third image; left out too, unless the
     least trust is 0."""
-    observations: ObservationShares
-    """Shares of keypoints that agree and contradict; NaN where there is no database."""
+    observations: EvidenceShares
+    """Shares of keypoints that agree and contradict; None where there is no database."""
     evidence: ModelEvidence = field(default_factory=ModelEvidence)
     """What speaks against it although it fits."""
 
@@ -268,11 +264,7 @@ class LocateResult(_Placed):
             pairs={status.name.lower(): count for status, count in self.directions.counts().items()}
             | {"outlier": len(placement.rejected_pairs)},
             num_contradicting=placement.num_contradicting,
-            agreement=EvidenceShares(
-                pairs=self.agreeing_pairs,
-                observations=self.observations.agreeing,
-                contradicting=self.observations.contradicting,
-            ),
+            agreement=replace(self.observations, pairs=self.agreeing_pairs),
             num_points=model.num_points3D(),
             mean_reprojection_error_px=model.compute_mean_reprojection_error(),
             num_points_as_nodes=int(np.sum(placement.nodes >= placement.num_cameras)),
@@ -280,15 +272,15 @@ class LocateResult(_Placed):
             scale_sigma=gauge.scale_sigma,
             known_distances=told_distances(self.distances, self.placed),
             wrong_priors=self._wrong_priors(),
-            datum=EarthDatum.of(gauge.datum),
+            datum=gauge.datum,
             rigid_groups=GroupFacts.of_placement(placement, self.kept, self.fixed),
             intrinsics=tuple(self.intrinsics.rows(self.placed)),
             refined_rigs=self.rigs,
             num_doubtful_pairs=len(self.doubtful_pairs),
             adjustment=PlacementAdjustment.of_estimate(self.adjustment),
-            lens_errors=placement.lens_errors and LensErrorFacts(**placement.lens_errors._asdict()),
+            lens_errors=placement.lens_errors,
             rotation_refinement=RotationRefinement.of_turns(self.turned_deg),
-            bundle_adjustment=BundleAdjustment.of(self.adjusted),
+            bundle_adjustment=self.adjusted and self.adjusted.solves,
         )
 
     def _headline(self) -> str:
@@ -305,7 +297,7 @@ class LocateResult(_Placed):
         """Whether the model can be used, and why."""
         is_posed, elsewhere = self.placed.is_posed, self.elsewhere
         shares = Shares(
-            self.observations.contradicting,
+            self.observations.contradicting or 0.0,
             placed=float(np.mean(is_posed if elsewhere is None else is_posed[~elsewhere])),
             here=float(np.mean(is_posed)),
         )
@@ -516,7 +508,7 @@ class GraphResult(_Placed):
                 num_right=len(right.edges),
                 num_fixed=right.num_fixed,
                 rigid=right.is_rigid,
-                solve=None if right.solved is None else Solve(**right.solved.summary()),
+                solve=None if right.solved is None else right.solved.facts,
             ),
         )
 

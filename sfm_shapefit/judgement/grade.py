@@ -67,7 +67,7 @@ FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to
 class Shares(NamedTuple):
     """How many observations contradict, and how many images are in the output; NaN where it is not known."""
 
-    contradicting: float = np.nan
+    contradicting: float = 0.0
     placed: float = np.nan
     here: float = np.nan
     """The same of all images; of several models, the others' are missing here, though they are placed."""

@@ -19,7 +19,7 @@ from sfm_shapefit.scene.evaluation import (
     evaluate_poses,
     evaluate_positions,
 )
-from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.given import EarthDatum
 from sfm_shapefit.scene.pose_errors import NamedPoses
 
 
@@ -85,16 +85,15 @@ def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEval
     )
 
 
-def model_datum(model: Any) -> Datum | None:
+def model_datum(model: Any) -> EarthDatum | None:
     """Return the datum of a result, or that in locate.json beside a model; None without."""
     if not isinstance(model, Path | str):
-        known = getattr(getattr(model, "facts", None), "datum", None)
-        return known and Datum(known.latitude_deg, known.longitude_deg, known.altitude_m)
+        return getattr(getattr(model, "facts", None), "datum", None)
     file = Path(model) / MARKER
     if not file.is_file():
         return None
     try:
         found = json.loads(text_of(file)).get("datum")
-        return None if found is None else Datum(**found)
+        return None if found is None else EarthDatum(**found)
     except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{file} cannot be read; run locate again, or remove it") from error

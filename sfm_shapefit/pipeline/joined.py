@@ -20,7 +20,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, compose
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.map_result import JoinedModel
-from sfm_shapefit.facts.model import EarthDatum, JoinedFacts
+from sfm_shapefit.facts.model import JoinedFacts
 from sfm_shapefit.facts.placed import UNITS, KeyFigures
 from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.rows import correlations_of, covariance_of
@@ -108,7 +108,7 @@ def tell_group(
         scale=gauge.statement,
         scale_sigma=gauge.scale_sigma,
         known_distances=told_distances(told.distances, model.images),
-        datum=EarthDatum.of(gauge.datum),
+        datum=gauge.datum,
         timings_s=clock.seconds,
         warnings=[*told.notes, *seen.warnings, *filter(None, [gauge.warning])],
     )

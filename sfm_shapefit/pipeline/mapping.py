@@ -3,7 +3,7 @@
 Frames that the averaging of a component drops are grouped anew by the pairs among themselves.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,6 @@ from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.map_result import MappedModel
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import Inputs, LocateResult
-from sfm_shapefit.facts.scene import Loop
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import UnposedImages, read_images
 from sfm_shapefit.files.colmap.database_pairs import refuse_no_features
@@ -50,7 +49,7 @@ from sfm_shapefit.rotations.average import average_relative_rotations, check_pai
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.options import AveragingOptions
-from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
+from sfm_shapefit.rotations.sequences import Loop, Videos, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.scene.given import Gravity, Known
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames, View, rows_of_pairs
@@ -132,17 +131,17 @@ class MapRun(NamedTuple):
 
     def judge_loops(
         self, videos: Videos, relative: RelativeRotations
-    ) -> tuple["MapRun", RelativeRotations, tuple[Visit, ...]]:
-        """Return run and pairs without loop pairs that the chains of their videos contradict, and visits."""
+    ) -> tuple["MapRun", RelativeRotations, tuple[Loop, ...]]:
+        """Return run and pairs without loop pairs that the chains of videos contradict, and all loops."""
         if not videos.num_videos:
             return self, relative, ()
         with self.clock("rotation averaging"):
-            loops = judge_loops(videos, relative, self.clock.threads)
+            found = judge_loops(videos, self.images.names, relative, self.clock.threads)
         names = self.images.names
-        refused = {(names[i], names[j]) for i, j in relative.pairs[loops.refused].tolist()}
-        kept = np.delete(np.arange(len(relative.pairs)), loops.refused)
+        refused = {(names[i], names[j]) for i, j in relative.pairs[found.refused].tolist()}
+        kept = np.delete(np.arange(len(relative.pairs)), found.refused)
         without = self.without | {(min(pair), max(pair)) for pair in refused}
-        return self._replace(without=without), relative.subset(kept), loops.visits
+        return self._replace(without=without), relative.subset(kept), found.loops
 
     def score_pairs(self, relative: RelativeRotations) -> "MapRun":
         """Return the run with the scores by which pairs of repeated structure are told."""
@@ -332,7 +331,7 @@ def _place_first(inputs: RunInputs, source: MatchSource, clock: Clock) -> Estima
 
 
 def locate_components(
-    run: MapRun, relative: RelativeRotations, visits: Sequence[Visit], reasons: dict[int, str]
+    run: MapRun, relative: RelativeRotations, loops: Sequence[Loop], reasons: dict[int, str]
 ) -> list[MappedModel]:
     """Return a model of each component that can be placed, most cameras first.
 
@@ -345,8 +344,9 @@ def locate_components(
         except UnsolvableError as error:
             reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
-        names = tuple(run.images.names[k] for k in members.tolist())
-        located = replace(located, loops=tuple(_loops_of(visits, run.images.names, set(names))))
+        names = run.images.names_of(members)
+        own = frozenset(names)
+        located = replace(located, loops=tuple(one for one in loops if one.first[0] in own))
         component = MappedModel(located=located, averaging=averaging, names=names)
         models += _rigid_models(component, run.options.averaging.min_model_size)
         for k in frames.tolist():
@@ -421,11 +421,3 @@ def _suspicions(averaging: AveragedRotations) -> Iterator[Reason]:
         yield of_model(Kind.REPEATED, clause)
     if averaging.num_rivals:
         yield of_model(Kind.REPEATED, "the images can be arranged in another way")
-
-
-def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) -> Iterator[Loop]:
-    """Yield the visits that begin among some images, by name."""
-    for visit in visits:
-        first, second = ((names[a], names[b]) for a, b in (visit.first, visit.second))
-        if first[0] in among:
-            yield Loop.taken_from(visit, first=first, second=second)

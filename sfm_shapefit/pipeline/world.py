@@ -17,7 +17,7 @@ from sfm_shapefit.base.geometry import Similarity, nearest_rotations
 from sfm_shapefit.files.colmap.earth import epsg_code, to_epsg
 from sfm_shapefit.files.lines import is_number
 from sfm_shapefit.pipeline.evaluate import model_datum
-from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.given import EarthDatum
 from sfm_shapefit.scene.images import Images
 
 _STEP = 100.0  # meters, half the distance over which turn and scale are measured; the error is below 1e-9
@@ -29,7 +29,7 @@ _ROUND = 100.0  # units; offsets that are found are multiples of it, as surveyor
 class World:
     """Where what is written stands."""
 
-    datum: Datum | None = None
+    datum: EarthDatum | None = None
     """Where the model's own axes are on Earth; None where no other system is asked for."""
     code: int = 0
     """EPSG code of the system; 0 without one."""

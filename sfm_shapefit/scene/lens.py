@@ -12,13 +12,14 @@ its first eight, its values: fx, fy, cx, cy, and its first four coefficients, of
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.scene.wide_lenses import (
     ANGLE,
     DIVISION,
@@ -360,12 +361,13 @@ def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float
     return np.where((step <= _STILL) & (u * u + v * v <= largest), [u, v], np.nan)
 
 
-class LensErrors(NamedTuple):
-    """What covariances take errors of the lenses for."""
+class LensErrors(Record):
+    """What the standard deviations take smooth errors of the lenses for, by what the residuals say."""
 
-    score: float
-    """Standard score of smooth errors that all images of a lens share, the largest of all lenses'."""
-    own_px: float
-    """Root of the mean square of the smooth errors of an image of its own; 0 where the lenses fit."""
-    shared_px: float
-    """The same of those that all images of a lens share, the largest of all lenses'."""
+    score: Annotated[
+        float,
+        "Standard score of errors that all images of a lens share, the largest; up to 3 they are noise, "
+        "from 4 on they count in full.",
+    ]
+    own_px: Annotated[float, "Errors of an image of its own, root of the mean square in pixels; 0 if none."]
+    shared_px: Annotated[float, "The same of errors that all images of a lens share."]

@@ -11,7 +11,7 @@ from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import weigh_evidence
 from sfm_shapefit.judgement.graph_grade import judge_graph
 from sfm_shapefit.judgement.reasons import Grade
-from sfm_shapefit.judgement.support import ObservationShares
+from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.prior_fit import PriorFit
@@ -66,7 +66,9 @@ def test_doubtful_and_left_out_cameras_are_named_the_left_out_first(found):
 def test_what_contradicts_makes_a_model_bad_and_what_sees_no_point_decides_nothing(
     found, share, contradicting, grade
 ):
-    verdict = replace(found, observations=ObservationShares(share, contradicting)).verdict
+    verdict = replace(
+        found, observations=EvidenceShares(observations=share, contradicting=contradicting)
+    ).verdict
     assert verdict.grade is grade
     told = "51% of the observations contradict the cameras"
     assert verdict.reasons == (() if grade is Grade.GOOD else (told,))

@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_shapefit.adjustment.estimate import BundleAdjustment
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics
-from sfm_shapefit.facts.model import BundleAdjustment
 from sfm_shapefit.facts.placed import IN_MEMORY, KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.judgement.evidence import ModelEvidence
