@@ -305,7 +305,12 @@ def next_of_model(grade: Grade, facts: FactsOfModel) -> NextStep:
         return NextStep("Next: find out what is wrong with the input.", step)
     looked = ", once you have looked" if grade is Grade.LOOK else ""
     text = f"Next: undistort the images for splatting or dense reconstruction{looked}."
-    return NextStep(text, "sfm-shapefit workspace {out} IMAGES {out_dense}")
+    return NextStep(text, "sfm-shapefit workspace {out} {images} {out_dense}")
+
+
+def _next_in(folder: str, grade: Grade, facts: FactsOfModel) -> NextStep:
+    """Return what to do with a model that was only looked at, in its folder."""
+    return next_of_model(grade, facts).at(out=folder, out_dense="dense")
 
 
 def _from_here(path: str) -> str:
@@ -327,9 +332,7 @@ class CheckedFacts(FactsOfModel):
     @property
     def next_step(self) -> NextStep:
         """What to do next, with the folder of the pictures where it is known."""
-        step = self._next()
-        images = shlex.quote(_from_here(self.images)) if self.images else "IMAGES"
-        return step._replace(command=step.command.replace(" IMAGES", f" {images}"))
+        return self._next().at(images=_from_here(self.images) if self.images else "IMAGES")
 
     def _next(self) -> NextStep:
         """Return what to do next, by the verdict and by what was asked."""
@@ -337,7 +340,7 @@ class CheckedFacts(FactsOfModel):
         is_alike = second is not None and second.is_alike
         is_sound = verdict.grade is Grade.GOOD or (verdict.grade is Grade.LOOK and is_alike)
         if is_sound and self.num_points:  # poses alone, as of a list, are to be placed with points
-            return next_of_model(verdict.grade, self).at(path)
+            return _next_in(self.inputs.path, verdict.grade, self)
         if (
             second is not None
             and not is_alike
@@ -359,16 +362,15 @@ class CheckedFacts(FactsOfModel):
         """Return how to get more evidence: from photographs, or from all pairs of them if asked."""
         if self.images:
             text = "Next: match all its photographs, and place them anew."
-            return NextStep(text, "sfm-shapefit map IMAGES mapped")
+            return NextStep(text, "sfm-shapefit map {images} mapped")
         text = "Next: check it against its photographs, or the database that it was made from (--database)."
-        return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")
+        return NextStep(text, f"sfm-shapefit check {path} --images {{images}}")
 
     def _next_of_map(self, second: SecondOpinion) -> NextStep:
         """Return how to take the model that `map` makes of the database: the one that was kept, or anew."""
         why = "; pairs support it" if second.wrong else ""
         if self.second_opinion:
-            kept = shlex.quote(f"{self.second_opinion}/{second.folder}")
-            step = next_of_model(second.grade, self).at(kept)
+            step = _next_in(f"{self.second_opinion}/{second.folder}", second.grade, self)
             return step._replace(text=f"Next: take the model that map made of the database{why}.")
         command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
         return NextStep(f"Next: take the model that map makes of the database{why}.", command)
@@ -380,7 +382,7 @@ class CheckedFacts(FactsOfModel):
             command = f"sfm-shapefit locate {path} located --intrinsics all{self.inputs.database_flag}"
             return NextStep(text, command)
         text = "Next: give all images of a device one lens, and reconstruct them again."
-        return NextStep(text, "sfm-shapefit map IMAGES mapped")
+        return NextStep(text, "sfm-shapefit map {images} mapped")
 
     def told(self, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Telling:
         """Return what the terminal says, of cameras what is weak about them."""

@@ -121,7 +121,7 @@ def measure_lens(lens: Lens, reach_px: float = np.nan) -> LensShape:
         short, long, stretch = bent - rho, rho - straight, rho[:asked] / straight[:asked]
     off = np.stack([short[asked:], long[asked:]]) * focal.mean()
     return LensShape(
-        focal_widths=lens.focal_px / max(lens.width, lens.height),
+        focal_widths=lens.focal_widths,
         view_deg=float(np.degrees(wider.sum())) if lens.is_plane else np.nan,
         folds=bool((~(along > 0.0) & inside).any()),
         of_sine=float(np.nanmin(rho[:asked] / bent[:asked], initial=1.0)),

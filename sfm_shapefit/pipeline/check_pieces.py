@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
@@ -62,7 +61,7 @@ def check_pieces(
             pieces.append(CheckedPiece(folder=name, error=str(error)))
             continue
         images[name] = found.model.images
-        widths = _focal_widths(images[name])
+        widths = images[name].focal_widths
         lenses = (float(widths.min()), float(widths.max()))
         pieces.append(CheckedPiece(folder=name, focal_widths=lenses, facts=found.facts))
     if not images:
@@ -70,11 +69,6 @@ def check_pieces(
     keep = set(_choose(pieces, images))
     pieces = [replace(one, keep=one.folder in keep) for one in pieces]
     return CheckedPieces(pieces=tuple(pieces), contradictions=(*_compare_lenses(images), *_shared(images)))
-
-
-def _focal_widths(images: Images) -> FloatArray:
-    """Return the focal length of each image over the longer side of its picture, (i,)."""
-    return np.asarray(images.focal_lengths_px / images.sizes_px.max(axis=1))
 
 
 def _choose(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -> Iterator[str]:
@@ -91,7 +85,7 @@ def _choose(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -> Ite
 def _compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
     """Yield where models disagree on the focal length of one device."""
     names = [name for one in images.values() for name in one.names]
-    widths = np.concatenate([_focal_widths(one) for one in images.values()])
+    widths = np.concatenate([one.focal_widths for one in images.values()])
     model = np.repeat(np.arange(len(images)), [one.num_images for one in images.values()])
     for rows, _ in find_sequences(names):
         there = np.unique(model[rows])

@@ -173,6 +173,11 @@ class Images:
         """Mean focal lengths, (i,); of a lens without one, pixels per radian."""
         return np.array([lens.focal_px for lens in self.lenses], dtype=np.float64)[self.lens_of]
 
+    @property
+    def focal_widths(self) -> FloatArray:
+        """Mean focal lengths over the longer sides of the pictures, (i,); NaN where a size is not known."""
+        return np.array([lens.focal_widths for lens in self.lenses], dtype=np.float64)[self.lens_of]
+
     def differ_in_rays(self, other: "Images") -> bool:
         """Return whether the rays of a lens differ by a hundredth between the same images."""
         return any(map(Lens.differs_in_rays, self.lenses, other.lenses))

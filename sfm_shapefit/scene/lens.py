@@ -157,6 +157,12 @@ class Lens:
         return self.model == "EQUIRECTANGULAR"
 
     @property
+    def focal_widths(self) -> float:
+        """Focal length over the longer side of the picture; NaN where its size is not known."""
+        longer = max(self.width, self.height)
+        return self.focal_px / longer if longer else np.nan
+
+    @property
     def focal_px(self) -> float:
         """Mean focal length; of an equirectangular picture, which has none, its pixels per radian."""
         count = self._num_focal
