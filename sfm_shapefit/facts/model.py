@@ -33,7 +33,7 @@ from sfm_shapefit.facts.placed import (
 )
 from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
 from sfm_shapefit.facts.scene import DistanceFacts, describe_line, describe_loops
-from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows, contradicting
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.second_opinion import SecondOpinion
@@ -384,14 +384,14 @@ class CheckedFacts(FactsOfModel):
         text = "Next: give all images of a device one lens, and reconstruct them again."
         return NextStep(text, "sfm-shapefit map {images} mapped")
 
-    def told(self, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Telling:
+    def told(self, cameras: Rows[CameraRow], pairs: Rows[PairRow]) -> Telling:
         """Return what the terminal says, of cameras what is weak about them."""
         # One that the second opinion confirms is not told, whatever its weakness.
         doubted = (row for row in cameras if row.placed and row.name in self.verdict.cameras)
         weak = [f"{row.name}: {row.reason}" for row in doubted if row.reason]
         absent = first_of([row.name for row in cameras if not row.placed])
-        judged = [pair for pair in pairs if pair.direction]  # the others say nothing of positions
-        lines = self.told_lines((sum(pair.contradicts for pair in judged), len(judged)))[:2]
+        judged = np.isfinite(pairs.columns["direction"]).all(axis=1)  # the others say nothing of positions
+        lines = self.told_lines((int(np.sum(contradicting(pairs) & judged)), int(judged.sum())))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
         notes = Row("warning", [one for one in self.warnings if one not in self.evidence.statements])
         rows = [Row("weak", weak), row("without a pose", absent), second, notes]

@@ -20,7 +20,7 @@ from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.geometry import extent_of, fit_similarity_l1, median_spread
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded
-from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.facts.tables import CameraRow, Rows
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.placement.place import Placement, count_large
@@ -77,7 +77,7 @@ class KeyFigures(Record):
 
     @classmethod
     def of_cameras(
-        cls, cameras: Sequence[CameraRow], pair_error_deg: float | None, focal_length_px: float, unit: str
+        cls, cameras: Rows[CameraRow], pair_error_deg: float | None, focal_length_px: float, unit: str
     ) -> Self:
         """Return the figures of placed cameras.
 
@@ -88,11 +88,11 @@ class KeyFigures(Record):
                 them; NaN for a bare graph.
             unit: what positions are given in, one of `UNITS` or `SOLVER_UNITS`.
         """
-        placed = [camera for camera in cameras if camera.placed]
-        centers = np.array([camera.center for camera in placed if camera.center])
+        placed, centers, sigmas = (cameras.columns[name] for name in ("placed", "center", "sigma"))
+        centers = centers[placed & np.isfinite(centers).all(axis=1)]
         extent = extent_of(centers) if len(centers) else 0.0
-        known = [max(camera.sigma) for camera in placed if camera.sigma and max(camera.sigma) > 0.0]
-        sigma = float(np.median(known)) if known else math.nan
+        known = sigmas[placed].max(axis=1)
+        sigma = float(np.median(known[known > 0.0])) if (known > 0.0).any() else math.nan
         sigma = sigma if math.isfinite(sigma) else math.nan
         error_deg = math.nan if pair_error_deg is None else pair_error_deg
         return cls(
@@ -349,7 +349,7 @@ class PlacedFacts(Facts):
 
 def facts_of_placement(
     placement: Judged,
-    cameras: Sequence[CameraRow],
+    cameras: Rows[CameraRow],
     solved: Iterable[tuple[int, str, int]],
     measures: tuple[float, str],
 ) -> dict[str, Any]:

@@ -39,7 +39,7 @@ from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.scene import told_distances
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows, Tabled
 from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import (
@@ -55,7 +55,7 @@ from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
-from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.placement.prior_fit import PriorFit
@@ -133,7 +133,10 @@ class _Placed(Written, Tabled):
     @property
     def told(self: Any) -> Telling:
         """What the terminal says."""
-        left_out = [f"{row.name}: {row.reason}" for row in self.cameras if not row.placed]
+        names, placed, reasons = (self.cameras.columns[name] for name in ("name", "placed", "reason"))
+        left_out = [
+            f"{name}: {reason}" for name, reason in zip(names[~placed], reasons[~placed], strict=True)
+        ]
         told: Telling = self.facts.told(left_out, self.placement.refined.statement())
         return told
 
@@ -338,33 +341,33 @@ class LocateResult(_Placed):
         return centers
 
     @cached_property
-    def cameras(self) -> list[CameraRow]:
+    def cameras(self) -> Rows[CameraRow]:
         """One row per image of the input: the posed ones by id, then those without a rotation."""
-        scale, solved_pieces = self.gauge.similarity.scale, [piece.placement for piece in self.further]
-        rows = camera_rows(self.placement, self._centers, scale, solved_pieces, self.gauge.axes)
-        for camera, reason in without_direction(self.directions, self.placement.graph).items():
-            rows[camera] = replace(rows[camera], reason=reason)
-        for camera, center in self._carried().items():
-            is_fixed = self.fixed is not None and self.fixed[camera]
-            reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
-            rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
+        pieces, cameras = [piece.placement for piece in self.further], self.placement.graph
+        rows = camera_rows(
+            self.placement, self._centers, self.gauge.similarity.scale, pieces, self.gauge.axes
+        )
+        reasons = rows.columns["reason"]
+        for camera, reason in without_direction(self.directions, cameras).items():
+            reasons[camera] = reason
+        carried = self._carried()
+        rows.columns["placed"][carried], rows.columns["piece"][carried] = True, 0
+        rows.columns["center"][carried] = self.placed.centers[carried]
+        fixed = np.zeros(len(rows), dtype=np.bool_) if self.fixed is None else self.fixed
+        reasons[carried] = np.where(fixed[carried], CARRIED_FIXED, CARRIED_BY_FRAME)
         for camera, count in self.few_points.items():
-            reason = (
-                f"it sees {counted(count, 'point')}, fewer than {self.options.structure.min_points_per_image}"
-            )
-            rows[camera] = replace(rows[camera], reason=reason)
-        for camera in self.cameras_without_support:
-            rows[camera] = replace(rows[camera], reason=NO_SUPPORT)
+            least = self.options.structure.min_points_per_image
+            reasons[camera] = f"it sees {counted(count, 'point')}, fewer than {least}"
+        reasons[self.cameras_without_support] = NO_SUPPORT
         off = self.prior_fit and self.prior_fit.off
-        for name, values in (("turned_deg", self.turned_deg), ("moved", self.moved), ("prior_off", off)):
-            if values is not None:
-                both = zip(rows, values.tolist(), strict=True)
-                rows = [replace(row, **{name: value}) for row, value in both]
+        told = {"turned_deg": self.turned_deg, "moved": self.moved, "prior_off": off}
+        rows = rows.changed({name: values for name, values in told.items() if values is not None})
         unposed = sorted(set(self.image_names) - set(self.images.names))
-        return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
+        why = ["the input has no rotation for it"] * len(unposed)
+        return rows.followed_by(Rows(CameraRow, rows.dimension, {"name": unposed, "reason": why}))
 
     @cached_property
-    def own_cameras(self) -> list[CameraRow]:
+    def own_cameras(self) -> Rows[CameraRow]:
         """One row per camera of the piece that is placed."""
         return own_camera_rows(self.placement, self._centers, self.gauge.similarity.scale)
 
@@ -408,42 +411,37 @@ class LocateResult(_Placed):
         fit = self.prior_fit
         return {} if fit is None else {self.images.names[k]: float(fit.off[k]) for k in fit.wrong.tolist()}
 
-    def _carried(self) -> dict[int, tuple[float, ...]]:
-        """Return the centers of images in the output that no pair placed: fixed ones, and rest of a frame."""
+    def _carried(self) -> IntArray:
+        """Return the images in the output that no pair placed: fixed ones, and rest of a frame, rows (k,)."""
         carried = self.placed.is_posed
         carried[self.placement.cameras[self.kept]] = False
-        rows = np.flatnonzero(carried).tolist()
-        return dict(zip(rows, map(tuple, self.placed.centers[carried].tolist()), strict=True))
+        return np.flatnonzero(carried)
 
     @cached_property
-    def pairs(self) -> list[PairRow]:
+    def pairs(self) -> Rows[PairRow]:
         """One row per pair that was looked at, usable or not, in the order of pairs."""
-        columns: dict[str, FloatArray] = {}
+        more: dict[str, FloatArray] = {}
         if self.scores is not None:
-            columns |= {"triplet_score": self.scores[:, 0], "matched_share": self.scores[:, 1]}
-            columns["pair_score"] = score_pairs(*self.scores.T)
+            more |= {"triplet_score": self.scores[:, 0], "matched_share": self.scores[:, 1]}
+            more["pair_score"] = score_pairs(*self.scores.T)
         if self.prior_fit is not None:
-            columns["prior_angle_deg"] = self.prior_fit.angles_deg
-        added = zip(*(column.tolist() for column in columns.values()), strict=True)
-        scores = [dict(zip(columns, values, strict=True)) for values in added]
-        scores = scores or [{}] * len(self.directions.pairs)
+            more["prior_angle_deg"] = self.prior_fit.angles_deg
         usable, names, axes = self.directions.usable(), self.images.names, self.gauge.axes
-        further = [piece.placement for piece in self.further]
-        support = self.directions.num_inliers[usable]
-        rows = pair_rows(self.placement, support, further, [scores[k] for k in usable.tolist()])
-        of_usable = iter(rows)
-        return [
-            _turn(next(of_usable), axes)
-            if status is DirectionStatus.USABLE
-            else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value, **given)
-            for (i, j), status, support, given in zip(
-                self.directions.pairs.tolist(),
-                self.directions.status,
-                self.directions.num_inliers.tolist(),
-                scores,
-                strict=True,
-            )
-        ]
+        ends, support = self.directions.pairs, self.directions.num_inliers
+        columns = {
+            "name1": [names[i] for i in ends[:, 0].tolist()],
+            "name2": [names[j] for j in ends[:, 1].tolist()],
+            "support": support,
+            "reason": [status.value for status in self.directions.status],
+        }
+        rows = Rows(PairRow, self.dimension, columns | more)
+        judged = pair_rows(self.placement, support[usable], [piece.placement for piece in self.further])
+        for name in judged.columns.keys() - more.keys() - {"name1", "name2", "support"}:
+            rows.columns[name][usable] = judged.columns[name]
+        if axes is not None:
+            turned = [axes @ direction for direction in judged.columns["direction"]]
+            rows.columns["direction"][usable] = np.reshape(turned, (-1, self.dimension))
+        return rows
 
     @cached_property
     def line_sigma(self) -> float | None:
@@ -459,16 +457,13 @@ class LocateResult(_Placed):
         return sigma if math.isfinite(sigma) else None
 
     @cached_property
-    def doubtful_pairs(self) -> list[PairRow]:
+    def doubtful_pairs(self) -> Rows[PairRow]:
         """The pairs that agree with the model and look like repeated structure all the same, worst first."""
-        doubtful = doubtful_pairs(np.array([row.pair_score for row in self.pairs])).tolist()
-        rows = [row for row, is_doubtful in zip(self.pairs, doubtful, strict=True) if is_doubtful]
-        used = [row for row in rows if row.verdict == Verdict.INLIER.value]
-        return sorted(used, key=lambda row: (row.pair_score, row.name1, row.name2))
-
-
-def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
-    return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
+        columns = self.pairs.columns
+        used = columns["verdict"] == Verdict.INLIER.value
+        rows = np.flatnonzero(doubtful_pairs(columns["pair_score"]) & used).tolist()
+        order = [columns[name] for name in ("pair_score", "name1", "name2")]
+        return self.pairs.taken(sorted(rows, key=lambda row: tuple(column[row] for column in order)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -537,12 +532,12 @@ class GraphResult(_Placed):
         return self.placement.warnings
 
     @cached_property
-    def cameras(self) -> list[CameraRow]:
+    def cameras(self) -> Rows[CameraRow]:
         """One row per node."""
         return camera_rows(self.placement, self.placement.locations, 1.0, self.further)
 
     @cached_property
-    def pairs(self) -> list[PairRow]:
+    def pairs(self) -> Rows[PairRow]:
         """One row per edge."""
         support = np.zeros(self.placement.num_pairs, dtype=np.int64)
         return pair_rows(self.placement, support, self.further)

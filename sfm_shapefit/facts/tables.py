@@ -11,11 +11,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, Literal, TextIO, TypeVar, get_args, overload
 
 import numpy as np
 import numpy.typing as npt
 
+from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.judgement.limits import KNOWN_DEG
@@ -96,38 +97,88 @@ class PairRow:
     posterior: float = math.nan
     """Probability that the direction is right, by its residual and by the residuals of all pairs."""
 
-    @property
-    def contradicts(self) -> bool:
-        """Whether it says that its cameras stand elsewhere; by less than a degree it does not."""
-        return self.verdict == Verdict.OUTLIER.value and not self.residual_deg < KNOWN_DEG
 
-
-_ROW_TYPES: dict[TableName, type[CameraRow] | type[PairRow]] = {"cameras": CameraRow, "pairs": PairRow}
+R = TypeVar("R", bound=CameraRow | PairRow)
 _PREFIXES = {"center": "", "sigma": "sigma_", "direction": "v", "correlation": "rho_"}
 """Beginning of the columns of a vector, one per axis, or per two axes."""
 
 
-def write_rows(
-    rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int, path: Path
-) -> None:
-    """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
+_KINDS: dict[Any, npt.DTypeLike] = {str: object, bool: np.bool_, int: np.int64, int | None: object}
+"""Types of columns by those of the fields; floats and vectors are float64."""
+
+
+class Rows(Sequence[R]):
+    """The rows of a table, kept as columns; a row is made when it is asked for."""
+
+    def __init__(self, kind: type[R], dimension: int, columns: Mapping[str, Any]) -> None:
+        """Take columns by the fields of a row, n values each, or (n, d) of vectors with NaN where unknown.
+
+        The first column is given; others that are not have the default of their field.
+        """
+        self.kind, self.dimension = kind, dimension
+        self.columns: dict[str, Column] = {}
+        for item in fields(kind):
+            width = len(columns_of_field(item.name, dimension)) if item.name in _PREFIXES else 0
+            default = item.default if not width else (math.nan,) * width
+            values = columns[item.name] if item.name in columns else [default] * len(self)
+            shape = (-1, width) if width else (-1,)
+            self.columns[item.name] = np.asarray(values, _KINDS.get(item.type, np.float64)).reshape(shape)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} rows of {self.kind.__name__}>"
+
+    @overload
+    def __getitem__(self, at: int) -> R: ...
+    @overload
+    def __getitem__(self, at: slice) -> list[R]: ...
+    def __getitem__(self, at: int | slice) -> R | list[R]:
+        if isinstance(at, slice):
+            return [self[k] for k in range(len(self))[at]]
+        return self.kind(**{name: _cell(values[at]) for name, values in self.columns.items()})
+
+    def taken(self, rows: Sequence[int]) -> "Rows[R]":
+        """Return some of the rows."""
+        picked = list(rows)
+        return self.changed({name: values[picked] for name, values in self.columns.items()})
+
+    def changed(self, columns: Mapping[str, Any]) -> "Rows[R]":
+        """Return the rows with other columns in place of some."""
+        return Rows(self.kind, self.dimension, self.columns | dict(columns))
+
+    def followed_by(self, more: "Rows[R]") -> "Rows[R]":
+        """Return these rows, and then others."""
+        own = self.columns.items()
+        return self.changed({name: np.concatenate([values, more.columns[name]]) for name, values in own})
+
+    def flat(self) -> dict[str, Column]:
+        """Return the columns of the CSV by their names there, (n,) each."""
+        found: dict[str, Column] = {}
+        for name, values in self.columns.items():
+            names = columns_of_field(name, self.dimension)
+            found |= {name: values} if values.ndim == 1 else dict(zip(names, values.T, strict=True))
+        return found
+
+
+def _cell(value: Any) -> Any:
+    """Return a value of a column as Python has it; a vector of which nothing is known is empty."""
+    if isinstance(value, np.ndarray):
+        return () if np.isnan(value).all() else tuple(value.tolist())
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def write_rows(rows: Rows[R], path: Path) -> None:
+    """Write rows as CSV; a vector of d numbers becomes d columns, one per axis."""
     with open_table(path) as stream:
-        write_csv(_values_of(rows, row_type, dimension), stream)
+        write_csv({name: values.tolist() for name, values in rows.flat().items()}, stream)
 
 
-def _values_of(
-    rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int
-) -> dict[str, list[Any]]:
-    """Return the values of each column; NaN along the axes of a vector that is not known."""
-    found: dict[str, list[Any]] = {}
-    for item in fields(row_type):
-        values, names = [getattr(row, item.name) for row in rows], columns_of_field(item.name, dimension)
-        if names == [item.name]:
-            found[item.name] = values
-        else:
-            whole = [value or (math.nan,) * len(names) for value in values]
-            found |= {name: [value[k] for value in whole] for k, name in enumerate(names)}
-    return found
+def contradicting(pairs: Rows[PairRow]) -> BoolArray:
+    """Return which pairs (m,) say that their cameras stand elsewhere; by less than a degree they do not."""
+    known_deg = pairs.columns["residual_deg"] < KNOWN_DEG
+    return np.asarray((pairs.columns["verdict"] == Verdict.OUTLIER.value) & ~known_deg)
 
 
 def read_trust(path: Path) -> dict[str, float]:
@@ -206,40 +257,15 @@ class Tabled:
 
     __slots__ = ()
 
-    @property
-    def dimension(self) -> int:
-        """Number of coordinates of a location."""
-        return 3
-
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them.
 
         Raises:
             ValueError: if there is no table of this name.
         """
-        if name not in _ROW_TYPES:
+        if name not in get_args(TableName):
             raise ValueError(f"there is no table {name!r}; there are 'cameras' and 'pairs'")
-        return columns_of(getattr(self, name), _ROW_TYPES[name], self.dimension)
-
-
-def columns_of(
-    rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type[CameraRow] | type[PairRow], dimension: int
-) -> dict[str, Column]:
-    """Return an array for each column of cameras.csv or pairs.csv, by its name there.
-
-    Returns:
-        n values each: numbers are float64, or int64 and bool where none can be missing, NaN where there is
-        none; texts are objects.
-    """
-    kinds = {item.name: item.type for item in fields(row_type)}
-    values = _values_of(rows, row_type, dimension)
-    return {name: _column(column, kinds.get(name)) for name, column in values.items()}
-
-
-def _column(values: list[Any], kind: Any) -> Column:
-    """Return values of a field's type as an array; those along an axis have no field of their own."""
-    if kind is str:
-        return np.array(values, dtype=object)
-    if kind in (bool, int):
-        return np.array(values, dtype=np.bool_ if kind is bool else np.int64)
-    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
+        columns = getattr(self, name).flat()
+        if name == "cameras":  # where it is none, NaN
+            columns["piece"] = columns["piece"].astype(np.float64)
+        return dict(columns)

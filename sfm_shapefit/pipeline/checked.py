@@ -12,7 +12,6 @@ The limits are set by the bundled scenes and twelve sound models of COLMAP, see 
 scripts/results/notes.md.
 """
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows, Tabled
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -76,9 +75,9 @@ class CheckResult(Reported, Tabled):
     """The verdict on a model, with the evidence for it."""
 
     model: ColmapModel
-    cameras: list[CameraRow]
+    cameras: Rows[CameraRow]
     """One row per image, those with a pose first; the reason says what is weak about a camera."""
-    pairs: list[PairRow]
+    pairs: Rows[PairRow]
     """One row per pair that was looked at."""
     quality: ImageQuality
     facts: CheckedFacts
@@ -139,7 +138,7 @@ def check_source(
         fits = fit_pairs(model.images.centers, measure(matches, options, clock).directions)
         if matches.inputs.is_made:
             structure = points_of_pictures(matches, fits)
-    pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
+    pairs, level_deg = _tell_pairs(model.images, fits), np.nan if fits is None else fits.level_deg
     with clock("evidence"):
         evidence = gather_evidence(matches, fits, structure, clock.threads)
         if matches.inputs.is_made or not matches.has_database:  # nothing else measured lenses
@@ -161,7 +160,7 @@ def check_source(
         recognized = ask_convention(matches, clock.threads)
     verdict = verdict.led_by(recognized and of_model(Kind.INPUT, recognized.sentence))
     more = (one for one in reasons if one.of_each and one not in weak and one.kind is not Kind.SECOND_OPINION)
-    cameras = _tell_cameras(model, pairs, [*weak, *more])
+    cameras = _tell_cameras(model, fits, [*weak, *more])
     facts = _tell(model, matches, cameras, pairs, quality)
     facts |= {"verdict": verdict, "residual_level_deg": level_deg, "timings_s": clock.seconds}
     facts |= {"evidence": evidence, "warnings": [*model.notes, *matches.matches.notes, *evidence.statements]}
@@ -201,43 +200,44 @@ def _compare(
     return replace(second, wrong=(), undecided=()) if is_confirmed else second
 
 
-def _tell_pairs(images: Images, fits: PairFits) -> list[PairRow]:
-    """Return a row per pair."""
-    rows, directions = [], fits.directions
-    for e, status in enumerate(directions.status):
-        i, j = directions.pairs[e]
-        is_judged = bool(np.isfinite(fits.residuals_deg[e]))
-        rows.append(
-            PairRow(
-                name1=images.names[i],
-                name2=images.names[j],
-                direction=tuple(directions.directions[e].tolist()) if is_judged else (),
-                support=int(directions.num_inliers[e]),
-                residual_deg=float(fits.residuals_deg[e]),
-                verdict=(Verdict.OUTLIER if fits.contradicts[e] else Verdict.INLIER).value,
-                reason="" if is_judged else status.value,
-            )
-        )
-    return rows
+def _tell_pairs(images: Images, fits: PairFits | None) -> Rows[PairRow]:
+    """Return a row per pair; none without any."""
+    if fits is None:
+        return Rows(PairRow, 3, {"name1": []})
+    directions, is_judged = fits.directions, np.isfinite(fits.residuals_deg)
+    columns = {
+        "name1": images.names_of(directions.pairs[:, 0]),
+        "name2": images.names_of(directions.pairs[:, 1]),
+        "direction": np.where(is_judged[:, None], directions.directions, np.nan),
+        "support": directions.num_inliers,
+        "residual_deg": fits.residuals_deg,
+        "verdict": np.where(fits.contradicts, Verdict.OUTLIER.value, Verdict.INLIER.value),
+        "reason": np.where(is_judged, "", [status.value for status in directions.status]),
+    }
+    return Rows(PairRow, 3, columns)
 
 
-def _tell_cameras(model: ColmapModel, pairs: list[PairRow], weak: list[Reason]) -> list[CameraRow]:
+def _tell_cameras(model: ColmapModel, fits: PairFits | None, weak: list[Reason]) -> Rows[CameraRow]:
     """Return a row per image, those with a pose first."""
-    names = model.images.names
-    degrees = Counter(name for pair in pairs if pair.direction for name in (pair.name1, pair.name2))
-    rows = [
-        CameraRow(
-            name=name,
-            placed=True,
-            reason="; ".join(one.sentence for one in weak if name in one.images),
-            piece=0,
-            center=tuple(center),
-            degree=degrees[name],
-        )
-        for name, center in zip(names, model.images.centers.tolist(), strict=True)
-    ]
-    others = set(model.image_names) - set(names)
-    return rows + [CameraRow(name=name, reason="it has no pose in the model") for name in sorted(others)]
+    names, others = model.images.names, sorted(set(model.image_names) - set(model.images.names))
+    judged = np.zeros((0, 2), dtype=np.int64)
+    if fits is not None:
+        judged = fits.directions.pairs[np.isfinite(fits.residuals_deg)]
+    clauses: dict[str, list[str]] = {name: [] for name in names}
+    for one in weak:
+        for name in one.images:
+            clauses[name].append(one.sentence)
+    columns = {
+        "name": names,
+        "placed": [True] * len(names),
+        "reason": ["; ".join(clauses[name]) for name in names],
+        "piece": [0] * len(names),
+        "center": model.images.centers,
+        "degree": np.bincount(judged.ravel(), minlength=len(names)),
+    }
+    reasons = ["it has no pose in the model"] * len(others)
+    unposed = Rows(CameraRow, 3, {"name": others, "reason": reasons})
+    return Rows(CameraRow, 3, columns).followed_by(unposed)
 
 
 def _find_weak(images: Images, quality: ImageQuality) -> Iterator[Reason]:
@@ -302,12 +302,13 @@ def _none_agrees(fits: PairFits, matches: MatchSource) -> Iterator[Reason]:
 def _tell(
     model: ColmapModel,
     matches: MatchSource,
-    cameras: list[CameraRow],
-    pairs: list[PairRow],
+    cameras: Rows[CameraRow],
+    pairs: Rows[PairRow],
     quality: ImageQuality,
 ) -> dict[str, Any]:
     """Return what is told of a model beside its verdict, by the fields of `CheckedFacts`."""
-    error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
+    residuals_deg = pairs.columns["residual_deg"]
+    error_deg = _median(residuals_deg[np.isfinite(residuals_deg)].tolist())
     measures = (float(np.median(model.images.focal_lengths_px)), "of the model's units")
     errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
     return {

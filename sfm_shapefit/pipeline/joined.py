@@ -9,13 +9,14 @@ is known. Errors of a join come on top, as if they moved each camera of the mode
 The verdict is no better than that of any of the models.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, compose
 from sfm_shapefit.facts.joins import Joined
@@ -23,9 +24,9 @@ from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.model import JoinedFacts
 from sfm_shapefit.facts.placed import UNITS, KeyFigures
 from sfm_shapefit.facts.result import Inputs, LocateResult
-from sfm_shapefit.facts.rows import correlations_of, covariance_of
+from sfm_shapefit.facts.rows import correlations_of, covariances_of
 from sfm_shapefit.facts.scene import told_distances
-from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.facts.tables import CameraRow, Rows
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import name_of, transform_model
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
@@ -93,7 +94,7 @@ def tell_group(
     source = replace(source.at(model.images), tied=tied)
     found = check_source(model, source, options, clock)
     seen, measures = found.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
-    cameras = list(_camera_rows(found.cameras, group, located))
+    cameras = _camera_rows(found.cameras, group, located)
     facts = JoinedFacts.taken_from(
         seen,
         inputs=told.inputs.facts,
@@ -151,24 +152,28 @@ def _choose_scale(
 
 
 def _camera_rows(
-    checked: Sequence[CameraRow], group: JoinedGroup, located: Mapping[int, LocateResult]
-) -> Iterator[CameraRow]:
-    """Yield the rows of the cameras that stand in the joined model, then those of the other images."""
+    checked: Rows[CameraRow], group: JoinedGroup, located: Mapping[int, LocateResult]
+) -> Rows[CameraRow]:
+    """Return the rows of the cameras that stand in the joined model, then those of the other images."""
     numbers = [number for number in group.world_from if number in located]
-    own = {row.name: (row, number) for number in reversed(numbers) for row in located[number].cameras}
-    variances = _variances_of_joins(group)
-    for seen in checked:
-        if not seen.placed or seen.name not in own:
-            yield seen
-            continue
-        row, number = own[seen.name]
-        sigma, correlation = _errors(row, group.world_from[number], variances[number])
-        reasons = [reason for reason in (row.reason, seen.reason) if reason]
-        yield replace(seen, reason="; ".join(reasons), trust=row.trust, sigma=sigma, correlation=correlation)
-    placed = {row.name for row in checked}
-    for name, (row, _) in own.items():
-        if name not in placed:
-            yield CameraRow(name=name, reason=row.reason, trust=row.trust)
+    own = {
+        name: (number, row)
+        for number in reversed(numbers)
+        for row, name in enumerate(located[number].cameras.columns["name"])
+    }
+    variances, columns = _variances_of_joins(group), {k: v.copy() for k, v in checked.columns.items()}
+    errors = {k: _errors(located[k].cameras, group.world_from[k], variances[k]) for k in numbers}
+    for row in np.flatnonzero(checked.columns["placed"]).tolist():
+        if (name := columns["name"][row]) in own:
+            number, source = own[name]
+            before = located[number].cameras[source]
+            columns["reason"][row] = "; ".join(filter(None, [before.reason, columns["reason"][row]]))
+            columns["trust"][row] = before.trust
+            columns["sigma"][row], columns["correlation"][row] = (part[source] for part in errors[number])
+    names = set(columns["name"])
+    others = [located[number].cameras[row] for name, (number, row) in own.items() if name not in names]
+    more = {name: [getattr(row, name) for row in others] for name in ("name", "reason", "trust")}
+    return checked.changed(columns).followed_by(Rows(CameraRow, 3, more))
 
 
 def _variances_of_joins(group: JoinedGroup) -> dict[int, float]:
@@ -181,17 +186,16 @@ def _variances_of_joins(group: JoinedGroup) -> dict[int, float]:
     return found
 
 
-def _errors(
-    row: CameraRow, world_from: Similarity, variance: float
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return standard deviations and correlations of a center in the joined model; nothing if not known."""
-    own = covariance_of(row) if row.sigma else np.full((3, 3), np.nan)
-    if not np.isfinite(own).all():
-        return row.sigma, row.correlation
-    turned = world_from.scale**2 * world_from.rotation @ own @ world_from.rotation.T
-    covariance = (turned + variance * np.eye(3))[None]
-    sigmas = np.sqrt(np.diagonal(covariance[0]))
-    return tuple(sigmas.tolist()), tuple(correlations_of(covariance)[0].tolist())
+def _errors(rows: Rows[CameraRow], world_from: Similarity, variance: float) -> tuple[FloatArray, FloatArray]:
+    """Return standard deviations and correlations (n, 3) of centers in the joined model, where known."""
+    own = covariances_of(rows)
+    known = np.isfinite(own).all(axis=(1, 2))
+    turned = world_from.scale**2 * world_from.rotation @ own[known] @ world_from.rotation.T
+    covariances = turned + variance * np.eye(3)
+    sigmas, correlations = rows.columns["sigma"].copy(), rows.columns["correlation"].copy()
+    sigmas[known] = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    correlations[known] = correlations_of(covariances)
+    return sigmas, correlations
 
 
 def _judge(seen: ModelVerdict, group: JoinedGroup, located: Mapping[int, LocateResult]) -> ModelVerdict:
