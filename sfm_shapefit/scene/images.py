@@ -174,6 +174,11 @@ class Images:
         return np.array([lens.focal_px for lens in self.lenses], dtype=np.float64)[self.lens_of]
 
     @property
+    def are_angular(self) -> BoolArray:
+        """Images in which the distance from the center grows with the angle, as of fisheyes, (i,)."""
+        return np.array([lens.is_angular for lens in self.lenses], dtype=np.bool_)[self.lens_of]
+
+    @property
     def focal_widths(self) -> FloatArray:
         """Mean focal lengths over the longer sides of the pictures, (i,); NaN where a size is not known."""
         return np.array([lens.focal_widths for lens in self.lenses], dtype=np.float64)[self.lens_of]

@@ -44,6 +44,8 @@ class _Model(NamedTuple):
     """Its projection, see `scene.wide_lenses`."""
     num_focal: int
     num_coefficients: int
+    bends: tuple[float, ...] = ()
+    """First coefficients to be tried where a lens that was guessed a plane may be a fisheye."""
 
 
 _LENS_MODELS = {
@@ -60,10 +62,10 @@ _LENS_MODELS = {
     "OPENCV_FISHEYE": _Model(ANGLE, 2, 4),
     "THIN_PRISM_FISHEYE": _Model(THIN_PRISM, 2, 8),
     "RAD_TAN_THIN_PRISM_FISHEYE": _Model(RAD_TAN, 2, 12),
-    "FOV": _Model(FOV, 2, 1),
-    "SIMPLE_DIVISION": _Model(DIVISION, 1, 1),
-    "DIVISION": _Model(DIVISION, 2, 1),
-    "EUCM": _Model(EUCM, 2, 2),
+    "FOV": _Model(FOV, 2, 1, (0.5, 1.0, 1.5)),
+    "SIMPLE_DIVISION": _Model(DIVISION, 1, 1, (-0.1, -0.3)),
+    "DIVISION": _Model(DIVISION, 2, 1, (-0.1, -0.3)),
+    "EUCM": _Model(EUCM, 2, 2, (0.4, 0.7)),
 }
 """All of pycolmap 4.2 but for EQUIRECTANGULAR, which has nothing to free."""
 ADJUSTED_ELSEWHERE = "intrinsics of this model are not adjusted here, but by COLMAP's bundle_adjuster"
@@ -152,6 +154,18 @@ class Lens:
         return self.is_adjustable and _LENS_MODELS[self.model].kind == PLANE
 
     @property
+    def is_angular(self) -> bool:
+        """Whether the distance from the center of its pictures grows with the angle, as of fisheyes."""
+        if self.is_adjustable:
+            return _LENS_MODELS[self.model].kind in (ANGLE, THIN_PRISM, RAD_TAN, FOV)
+        return self.is_panorama or "FISHEYE" in self.model
+
+    @property
+    def bends(self) -> tuple[float, ...]:
+        """First coefficients that make a fisheye of the lens, to be tried; empty of most models."""
+        return _LENS_MODELS[self.model].bends if self.is_adjustable else ()
+
+    @property
     def is_panorama(self) -> bool:
         """Whether its pictures show all directions, as longitude and latitude."""
         return self.model == "EQUIRECTANGULAR"
@@ -209,7 +223,8 @@ class Lens:
             raise InputError(
                 f"lens model {self.model} cannot be adjusted; undistort it, or give one of {known}"
             )
-        wanted = 2 + sum(_LENS_MODELS[self.model][1:])
+        known_as = _LENS_MODELS[self.model]
+        wanted = 2 + known_as.num_focal + known_as.num_coefficients
         if len(self.parameters) != wanted or not np.isfinite(self.parameters).all():
             raise InputError(f"a lens of model {self.model} takes {wanted} finite parameters")
         if min(self.values()[:2]) <= 0.0:
@@ -217,7 +232,7 @@ class Lens:
 
     def row(self) -> FloatArray:
         """Return the numbers that a projection takes, (17,), see `scene.wide_lenses`; values come first."""
-        kind, num_focal, _ = _LENS_MODELS[self.model]
+        kind, num_focal, *_ = _LENS_MODELS[self.model]
         row, others = np.zeros(ROW), self.parameters[num_focal:]
         row[0], row[1], row[KIND] = self.parameters[0], self.parameters[num_focal - 1], kind
         row[2 : 2 + len(others)] = others
@@ -236,7 +251,7 @@ class Lens:
         """Return which of the values the model states by itself, (8,): fy is none where it is fx."""
         own = np.zeros(NUM_VALUES, np.bool_)
         if self.is_adjustable:
-            _, num_focal, num_coefficients = _LENS_MODELS[self.model]
+            _, num_focal, num_coefficients, _ = _LENS_MODELS[self.model]
             own[: 4 + num_coefficients] = True
             own[1] = num_focal == 2
         return own
