@@ -26,6 +26,7 @@ from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.placement.place import Placement, count_large
 from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.solver.options import Solve, Status
+from sfm_shapefit.solver.splitting.lud import Lud
 
 UNITS = {
     "input": "of the input's units",
@@ -221,15 +222,6 @@ class Delivered(Record):
         )
 
 
-class Lud(Record):
-    """The LUD start and its own dual bound, in its own units."""
-
-    objective: Annotated[float, "Value of the LUD program at its start."]
-    dual_bound: Annotated[float | None, "No placement has a lower objective."]
-    equality_residual: Annotated[float | None, "Violation of the dual's equality, as in `Solve`."]
-    iterations: Annotated[int, "Iterations of its solver."]
-
-
 class Finish(Record):
     """From the certified optimum to the centers."""
 
@@ -267,7 +259,6 @@ class Finish(Record):
             moved_median=refined.moved[0],
             moved_max=refined.moved[1],
             num_put_back=len(refined.reset_nodes),
-            lud=Lud.of(refined.lud),
             reweighted=refined.reweighted and refined.reweighted.solved.facts,
         )
 
