@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_shapefit.facts.model import ModelFacts, ModelInputs
 from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.judgement.support import EvidenceShares
@@ -75,7 +75,7 @@ def table_of(rows, kind, dimension=3):
     known = {
         name: values for name, values in columns.items() if name == names[0] or any(map(np.size, values))
     }
-    return Rows(kind, dimension, known)
+    return Table(kind, dimension, known)
 
 
 def draw(cameras, pairs, dimension=3, **more):

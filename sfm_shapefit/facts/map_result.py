@@ -24,7 +24,7 @@ from sfm_shapefit.facts.model import (
 )
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows, Tabled
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, Tabled
 from sfm_shapefit.judgement.grade import FEW_PLACED, in_another_model
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -58,9 +58,9 @@ class JoinedModel(Written, Tabled):
     """Their numbers; the world is that of the first, scaled if known distances between them give a scale."""
     joins: tuple[Joined, ...]
     """What came of joining each model to another, those included that are not in this one."""
-    cameras: Rows[CameraRow]
+    cameras: Table[CameraRow]
     """One row per image of these models."""
-    pairs: Rows[PairRow]
+    pairs: Table[PairRow]
     """One row per pair of these that was looked at."""
     facts: JoinedFacts
     """What stands in its locate.json."""

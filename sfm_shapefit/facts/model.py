@@ -33,7 +33,7 @@ from sfm_shapefit.facts.placed import (
 )
 from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
 from sfm_shapefit.facts.scene import DistanceFacts, describe_line, describe_loops
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows, contradicting
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.second_opinion import SecondOpinion
@@ -384,7 +384,7 @@ class CheckedFacts(FactsOfModel):
         text = "Next: give all images of a device one lens, and reconstruct them again."
         return NextStep(text, "sfm-shapefit map {images} mapped")
 
-    def told(self, cameras: Rows[CameraRow], pairs: Rows[PairRow]) -> Telling:
+    def told(self, cameras: Table[CameraRow], pairs: Table[PairRow]) -> Telling:
         """Return what the terminal says, of cameras what is weak about them."""
         # One that the second opinion confirms is not told, whatever its weakness.
         doubted = (row for row in cameras if row.placed and row.name in self.verdict.cameras)

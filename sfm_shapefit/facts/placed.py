@@ -20,7 +20,7 @@ from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.geometry import extent_of, fit_similarity_l1, median_spread
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded
-from sfm_shapefit.facts.tables import CameraRow, Rows
+from sfm_shapefit.facts.tables import CameraRow, Table
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.placement.place import Placement, count_large
@@ -78,7 +78,7 @@ class KeyFigures(Record):
 
     @classmethod
     def of_cameras(
-        cls, cameras: Rows[CameraRow], pair_error_deg: float | None, focal_length_px: float, unit: str
+        cls, cameras: Table[CameraRow], pair_error_deg: float | None, focal_length_px: float, unit: str
     ) -> Self:
         """Return the figures of placed cameras.
 
@@ -340,7 +340,7 @@ class PlacedFacts(Facts):
 
 def facts_of_placement(
     placement: Judged,
-    cameras: Rows[CameraRow],
+    cameras: Table[CameraRow],
     solved: Iterable[tuple[int, str, int]],
     measures: tuple[float, str],
 ) -> dict[str, Any]:

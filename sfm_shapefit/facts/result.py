@@ -39,7 +39,7 @@ from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.scene import told_distances
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows, Tabled
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, Tabled
 from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import (
@@ -341,7 +341,7 @@ class LocateResult(_Placed):
         return centers
 
     @cached_property
-    def cameras(self) -> Rows[CameraRow]:
+    def cameras(self) -> Table[CameraRow]:
         """One row per image of the input: the posed ones by id, then those without a rotation."""
         pieces, cameras = [piece.placement for piece in self.further], self.placement.graph
         rows = camera_rows(
@@ -364,10 +364,10 @@ class LocateResult(_Placed):
         rows = rows.changed({name: values for name, values in told.items() if values is not None})
         unposed = sorted(set(self.image_names) - set(self.images.names))
         why = ["the input has no rotation for it"] * len(unposed)
-        return rows.followed_by(Rows(CameraRow, rows.dimension, {"name": unposed, "reason": why}))
+        return rows.followed_by(Table(CameraRow, rows.dimension, {"name": unposed, "reason": why}))
 
     @cached_property
-    def own_cameras(self) -> Rows[CameraRow]:
+    def own_cameras(self) -> Table[CameraRow]:
         """One row per camera of the piece that is placed."""
         return own_camera_rows(self.placement, self._centers, self.gauge.similarity.scale)
 
@@ -418,7 +418,7 @@ class LocateResult(_Placed):
         return np.flatnonzero(carried)
 
     @cached_property
-    def pairs(self) -> Rows[PairRow]:
+    def pairs(self) -> Table[PairRow]:
         """One row per pair that was looked at, usable or not, in the order of pairs."""
         more: dict[str, FloatArray] = {}
         if self.scores is not None:
@@ -434,7 +434,7 @@ class LocateResult(_Placed):
             "support": support,
             "reason": [status.value for status in self.directions.status],
         }
-        rows = Rows(PairRow, self.dimension, columns | more)
+        rows = Table(PairRow, self.dimension, columns | more)
         judged = pair_rows(self.placement, support[usable], [piece.placement for piece in self.further])
         for name in judged.columns.keys() - more.keys() - {"name1", "name2", "support"}:
             rows.columns[name][usable] = judged.columns[name]
@@ -457,7 +457,7 @@ class LocateResult(_Placed):
         return sigma if math.isfinite(sigma) else None
 
     @cached_property
-    def doubtful_pairs(self) -> Rows[PairRow]:
+    def doubtful_pairs(self) -> Table[PairRow]:
         """The pairs that agree with the model and look like repeated structure all the same, worst first."""
         columns = self.pairs.columns
         used = columns["verdict"] == Verdict.INLIER.value
@@ -532,12 +532,12 @@ class GraphResult(_Placed):
         return self.placement.warnings
 
     @cached_property
-    def cameras(self) -> Rows[CameraRow]:
+    def cameras(self) -> Table[CameraRow]:
         """One row per node."""
         return camera_rows(self.placement, self.placement.locations, 1.0, self.further)
 
     @cached_property
-    def pairs(self) -> Rows[PairRow]:
+    def pairs(self) -> Table[PairRow]:
         """One row per edge."""
         support = np.zeros(self.placement.num_pairs, dtype=np.int64)
         return pair_rows(self.placement, support, self.further)

@@ -11,7 +11,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.placed import folder_of
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows, name_in, write_csv
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, name_in, write_csv
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.rigidity import left_out_reasons
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -33,7 +33,7 @@ def camera_rows(
     scale: float,
     further: Sequence[Judged] = (),
     axes: FloatArray | None = None,
-) -> Rows[CameraRow]:
+) -> Table[CameraRow]:
     """Return one row per camera of a placed graph.
 
     Args:
@@ -68,7 +68,7 @@ def camera_rows(
         "degree": _degrees(graph.edges[: placement.num_pairs], placement.num_cameras),
         "reason": [reasons.get(camera, "") for camera in cameras],
     }
-    rows = Rows(CameraRow, graph.dimension, told)
+    rows = Table(CameraRow, graph.dimension, told)
     for name, values in own_camera_rows(placement, centers, scale, axes).columns.items():
         if name != "degree":
             rows.columns[name][placement.cameras] = values
@@ -77,7 +77,7 @@ def camera_rows(
 
 def own_camera_rows(
     placement: Judged, centers: FloatArray, scale: float, axes: FloatArray | None = None
-) -> Rows[CameraRow]:
+) -> Table[CameraRow]:
     """Return the rows of the cameras of the piece that is solved; arguments as of `camera_rows`."""
     graph, assessment, cameras = placement.graph, placement.assessment, placement.cameras
     inside = graph.edges[placement.edges[placement.pairs]]
@@ -95,7 +95,7 @@ def own_camera_rows(
         "sigma": scale * standard_deviations(covariances),
         "correlation": correlations_of(covariances),
     }
-    return Rows(CameraRow, graph.dimension, told)
+    return Table(CameraRow, graph.dimension, told)
 
 
 def _degrees(pairs: IntArray, count: int) -> IntArray:
@@ -110,7 +110,7 @@ def _turned(covariances: FloatArray, axes: FloatArray) -> FloatArray:
     return turned
 
 
-def covariances_of(rows: Rows[CameraRow]) -> FloatArray:
+def covariances_of(rows: Table[CameraRow]) -> FloatArray:
     """Return the covariances (n, 3, 3) of centers, of the first three axes; NaN where nothing holds one."""
     sigmas, d = rows.columns["sigma"], rows.dimension
     found = np.zeros((len(rows), max(d, 3), max(d, 3)))
@@ -159,7 +159,7 @@ def pair_rows(
     support: IntArray,
     further: Sequence[Judged] = (),
     more: Mapping[str, FloatArray] | None = None,
-) -> Rows[PairRow]:
+) -> Table[PairRow]:
     """Return one row per pair of cameras (m,), with its number of inlier matches, and `more` columns.
 
     Pairs of the `further` pieces that are solved are judged by these.
@@ -189,7 +189,7 @@ def pair_rows(
         "reason": reasons,
     }
     columns |= zip(("residual_deg", "dual_norm", "leverage", "posterior"), figures, strict=True)
-    return Rows(PairRow, graph.dimension, columns | dict(more or {}))
+    return Table(PairRow, graph.dimension, columns | dict(more or {}))
 
 
 def without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int, str]:

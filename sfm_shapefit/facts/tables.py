@@ -107,7 +107,7 @@ _KINDS: dict[Any, npt.DTypeLike] = {str: object, bool: np.bool_, int: np.int64, 
 """Types of columns by those of the fields; floats and vectors are float64."""
 
 
-class Rows(Sequence[R]):
+class Table(Sequence[R]):
     """The rows of a table, kept as columns; a row is made when it is asked for."""
 
     def __init__(self, kind: type[R], dimension: int, columns: Mapping[str, Any]) -> None:
@@ -139,16 +139,16 @@ class Rows(Sequence[R]):
             return [self[k] for k in range(len(self))[at]]
         return self.kind(**{name: _cell(values[at]) for name, values in self.columns.items()})
 
-    def taken(self, rows: Sequence[int]) -> "Rows[R]":
+    def taken(self, rows: Sequence[int]) -> "Table[R]":
         """Return some of the rows."""
         picked = list(rows)
         return self.changed({name: values[picked] for name, values in self.columns.items()})
 
-    def changed(self, columns: Mapping[str, Any]) -> "Rows[R]":
+    def changed(self, columns: Mapping[str, Any]) -> "Table[R]":
         """Return the rows with other columns in place of some."""
-        return Rows(self.kind, self.dimension, self.columns | dict(columns))
+        return Table(self.kind, self.dimension, self.columns | dict(columns))
 
-    def followed_by(self, more: "Rows[R]") -> "Rows[R]":
+    def followed_by(self, more: "Table[R]") -> "Table[R]":
         """Return these rows, and then others."""
         own = self.columns.items()
         return self.changed({name: np.concatenate([values, more.columns[name]]) for name, values in own})
@@ -169,13 +169,13 @@ def _cell(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def write_rows(rows: Rows[R], path: Path) -> None:
+def write_rows(rows: Table[R], path: Path) -> None:
     """Write rows as CSV; a vector of d numbers becomes d columns, one per axis."""
     with open_table(path) as stream:
         write_csv({name: values.tolist() for name, values in rows.flat().items()}, stream)
 
 
-def contradicting(pairs: Rows[PairRow]) -> BoolArray:
+def contradicting(pairs: Table[PairRow]) -> BoolArray:
     """Return which pairs (m,) say that their cameras stand elsewhere; by less than a degree they do not."""
     known_deg = pairs.columns["residual_deg"] < KNOWN_DEG
     return np.asarray((pairs.columns["verdict"] == Verdict.OUTLIER.value) & ~known_deg)

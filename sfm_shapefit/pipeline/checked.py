@@ -31,7 +31,7 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows, Tabled
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, Tabled
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -75,9 +75,9 @@ class CheckResult(Reported, Tabled):
     """The verdict on a model, with the evidence for it."""
 
     model: ColmapModel
-    cameras: Rows[CameraRow]
+    cameras: Table[CameraRow]
     """One row per image, those with a pose first; the reason says what is weak about a camera."""
-    pairs: Rows[PairRow]
+    pairs: Table[PairRow]
     """One row per pair that was looked at."""
     quality: ImageQuality
     facts: CheckedFacts
@@ -200,10 +200,10 @@ def _compare(
     return replace(second, wrong=(), undecided=()) if is_confirmed else second
 
 
-def _tell_pairs(images: Images, fits: PairFits | None) -> Rows[PairRow]:
+def _tell_pairs(images: Images, fits: PairFits | None) -> Table[PairRow]:
     """Return a row per pair; none without any."""
     if fits is None:
-        return Rows(PairRow, 3, {"name1": []})
+        return Table(PairRow, 3, {"name1": []})
     directions, is_judged = fits.directions, np.isfinite(fits.residuals_deg)
     columns = {
         "name1": images.names_of(directions.pairs[:, 0]),
@@ -214,10 +214,10 @@ def _tell_pairs(images: Images, fits: PairFits | None) -> Rows[PairRow]:
         "verdict": np.where(fits.contradicts, Verdict.OUTLIER.value, Verdict.INLIER.value),
         "reason": np.where(is_judged, "", [status.value for status in directions.status]),
     }
-    return Rows(PairRow, 3, columns)
+    return Table(PairRow, 3, columns)
 
 
-def _tell_cameras(model: ColmapModel, fits: PairFits | None, weak: list[Reason]) -> Rows[CameraRow]:
+def _tell_cameras(model: ColmapModel, fits: PairFits | None, weak: list[Reason]) -> Table[CameraRow]:
     """Return a row per image, those with a pose first."""
     names, others = model.images.names, sorted(set(model.image_names) - set(model.images.names))
     judged = np.zeros((0, 2), dtype=np.int64)
@@ -226,7 +226,7 @@ def _tell_cameras(model: ColmapModel, fits: PairFits | None, weak: list[Reason])
     clauses: dict[str, list[str]] = {name: [] for name in names}
     for one in weak:
         for name in one.images:
-            clauses[name].append(one.sentence)
+            clauses.setdefault(name, []).append(one.sentence)
     columns = {
         "name": names,
         "placed": [True] * len(names),
@@ -236,8 +236,8 @@ def _tell_cameras(model: ColmapModel, fits: PairFits | None, weak: list[Reason])
         "degree": np.bincount(judged.ravel(), minlength=len(names)),
     }
     reasons = ["it has no pose in the model"] * len(others)
-    unposed = Rows(CameraRow, 3, {"name": others, "reason": reasons})
-    return Rows(CameraRow, 3, columns).followed_by(unposed)
+    unposed = Table(CameraRow, 3, {"name": others, "reason": reasons})
+    return Table(CameraRow, 3, columns).followed_by(unposed)
 
 
 def _find_weak(images: Images, quality: ImageQuality) -> Iterator[Reason]:
@@ -302,8 +302,8 @@ def _none_agrees(fits: PairFits, matches: MatchSource) -> Iterator[Reason]:
 def _tell(
     model: ColmapModel,
     matches: MatchSource,
-    cameras: Rows[CameraRow],
-    pairs: Rows[PairRow],
+    cameras: Table[CameraRow],
+    pairs: Table[PairRow],
     quality: ImageQuality,
 ) -> dict[str, Any]:
     """Return what is told of a model beside its verdict, by the fields of `CheckedFacts`."""

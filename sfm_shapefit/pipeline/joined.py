@@ -26,7 +26,7 @@ from sfm_shapefit.facts.placed import UNITS, KeyFigures
 from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.rows import correlations_of, covariances_of
 from sfm_shapefit.facts.scene import told_distances
-from sfm_shapefit.facts.tables import CameraRow, Rows
+from sfm_shapefit.facts.tables import CameraRow, Table
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import name_of, transform_model
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
@@ -152,8 +152,8 @@ def _choose_scale(
 
 
 def _camera_rows(
-    checked: Rows[CameraRow], group: JoinedGroup, located: Mapping[int, LocateResult]
-) -> Rows[CameraRow]:
+    checked: Table[CameraRow], group: JoinedGroup, located: Mapping[int, LocateResult]
+) -> Table[CameraRow]:
     """Return the rows of the cameras that stand in the joined model, then those of the other images."""
     numbers = [number for number in group.world_from if number in located]
     own = {
@@ -173,7 +173,7 @@ def _camera_rows(
     names = set(columns["name"])
     others = [located[number].cameras[row] for name, (number, row) in own.items() if name not in names]
     more = {name: [getattr(row, name) for row in others] for name in ("name", "reason", "trust")}
-    return checked.changed(columns).followed_by(Rows(CameraRow, 3, more))
+    return checked.changed(columns).followed_by(Table(CameraRow, 3, more))
 
 
 def _variances_of_joins(group: JoinedGroup) -> dict[int, float]:
@@ -186,7 +186,7 @@ def _variances_of_joins(group: JoinedGroup) -> dict[int, float]:
     return found
 
 
-def _errors(rows: Rows[CameraRow], world_from: Similarity, variance: float) -> tuple[FloatArray, FloatArray]:
+def _errors(rows: Table[CameraRow], world_from: Similarity, variance: float) -> tuple[FloatArray, FloatArray]:
     """Return standard deviations and correlations (n, 3) of centers in the joined model, where known."""
     own = covariances_of(rows)
     known = np.isfinite(own).all(axis=(1, 2))

@@ -23,7 +23,7 @@ from sfm_shapefit.facts.map_result import JoinedModel, MapResult
 from sfm_shapefit.facts.placed import IN_MEMORY, folder_of
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import covariances_of, covariances_text, own_camera_rows
-from sfm_shapefit.facts.tables import CameraRow, Rows, write_rows
+from sfm_shapefit.facts.tables import CameraRow, Table, write_rows
 from sfm_shapefit.files.colmap.seed import write_model
 from sfm_shapefit.files.options import MADE_FIRST, SIDECARS
 from sfm_shapefit.pipeline.colors import Result, with_colors
@@ -133,7 +133,7 @@ def _write_files(
         _write_report(found, folder / "report.html", options.images)
 
 
-def _write_cameras(rows: Rows[CameraRow], folder: Path) -> None:
+def _write_cameras(rows: Table[CameraRow], folder: Path) -> None:
     """Write cameras.csv and, in space and where any is known, the covariances of centers."""
     write_rows(rows, folder / "cameras.csv")
     every = zip(rows.columns["name"], covariances_of(rows), strict=True)

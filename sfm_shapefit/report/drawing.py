@@ -1,6 +1,6 @@
 """The drawing of a result: cameras, pairs and points as plain arrays. Page and mesh share it.
 
-Rows of `Cameras` and `Pairs` are those of cameras.csv and pairs.csv, in their order, so that a drawing can be
+Table of `Cameras` and `Pairs` are those of cameras.csv and pairs.csv, in their order, so that a drawing can be
 made of a result in memory or of its files. Positions are in the output's units and axes; what has no
 position holds NaN. Bare graphs of two dimensions lie in the plane z = 0, of more than three dimensions the
 first three are drawn.
@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.facts.rows import covariances_of
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows, contradicting
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.scene.images import Images
@@ -180,8 +180,8 @@ class Drawing:
 
 
 def build_drawing(
-    cameras: Rows[CameraRow],
-    pairs: Rows[PairRow],
+    cameras: Table[CameraRow],
+    pairs: Table[PairRow],
     *,
     poses: Poses | None = None,
     points: PickedPoints | None = None,
@@ -277,7 +277,7 @@ def _unknown_poses(n: int) -> Poses:
     )
 
 
-def _cameras(rows: Rows[CameraRow], poses: Poses) -> Cameras:
+def _cameras(rows: Table[CameraRow], poses: Poses) -> Cameras:
     columns, centers = rows.columns, np.zeros((len(rows), max(rows.dimension, 3)))
     centers[:, : rows.dimension] = columns["center"]
     centers[np.isnan(columns["center"]).any(axis=1)] = np.nan
@@ -294,7 +294,7 @@ def _cameras(rows: Rows[CameraRow], poses: Poses) -> Cameras:
     )
 
 
-def _pairs(rows: Rows[PairRow], cameras: Cameras, certified: FloatArray | None) -> Pairs:
+def _pairs(rows: Table[PairRow], cameras: Cameras, certified: FloatArray | None) -> Pairs:
     row_of, columns = {name: k for k, name in enumerate(cameras.names)}, rows.columns
     ends = np.array([[row_of[name] for name in columns[end]] for end in ("name1", "name2")], dtype=np.int64).T
     directions, undetermined = columns["direction"], columns["verdict"] == Verdict.UNDETERMINED.value

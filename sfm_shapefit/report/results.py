@@ -9,7 +9,7 @@ import numpy as np
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import GraphResult, LocateResult
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.files.colmap.seed import pick_points
 from sfm_shapefit.judgement.image_quality import ImageQuality
@@ -45,7 +45,7 @@ def draw_joined(found: JoinedModel) -> Drawing:
 
 
 def draw_checked(
-    model: ColmapModel, cameras: Rows[CameraRow], pairs: Rows[PairRow], quality: ImageQuality
+    model: ColmapModel, cameras: Table[CameraRow], pairs: Table[PairRow], quality: ImageQuality
 ) -> Drawing:
     """Return the drawing of a model that was judged, with how well points hold each of its images."""
     drawing = _draw_as_it_stands(model, cameras, pairs)
@@ -58,13 +58,13 @@ def draw_model(model: ColmapModel, trust: Mapping[str, float]) -> Drawing:
     images = model.images
     told = {"name": images.names, "placed": images.is_posed, "center": images.centers}
     known = {"trust": [trust.get(name, math.nan) for name in images.names]}
-    rows, pairs = Rows(CameraRow, 3, told | known), Rows(PairRow, 3, {"name1": []})
+    rows, pairs = Table(CameraRow, 3, told | known), Table(PairRow, 3, {"name1": []})
     return build_drawing(
         rows, pairs, poses=poses_of(images, images.names), points=pick_points(model.arrays, MAX_POINTS)
     )
 
 
-def _draw_as_it_stands(model: ColmapModel, cameras: Rows[CameraRow], pairs: Rows[PairRow]) -> Drawing:
+def _draw_as_it_stands(model: ColmapModel, cameras: Table[CameraRow], pairs: Table[PairRow]) -> Drawing:
     """Return the drawing of a model that is the input itself, so that there is nothing to compare it with."""
     poses = poses_of(model.images, list(cameras.columns["name"]))
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))

@@ -67,3 +67,11 @@ def test_cameras_without_a_place_are_not_asked():
     centers, pairs, directions, agrees = scene()
     centers[0] = np.nan
     assert find_other_places(NAMES, centers, pairs, directions, agrees, 0.1) == ()
+
+
+def test_the_offset_of_another_place_goes_to_the_units_and_axes_of_the_output():
+    (found,) = find_other_places(NAMES, *scene(), 0.1)
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    x, y, z = found.offset
+    assert found.moved(2.0, None).offset == (2.0 * x, 2.0 * y, 2.0 * z)
+    assert found.moved(2.0, turn).offset == (-2.0 * y, 2.0 * x, 2.0 * z)

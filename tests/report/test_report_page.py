@@ -14,7 +14,7 @@ from sfm_shapefit.adjustment.estimate import BundleAdjustment
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics
 from sfm_shapefit.facts.placed import IN_MEMORY, KeyFigures
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Rows, contradicting
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.report import thumbnails
@@ -374,7 +374,7 @@ def test_thumbnails_are_small_in_all_and_only_of_files_inside_the_folder(tmp_pat
 def test_a_pair_that_is_off_by_little_does_not_contradict():
     told = {"name1": "aaa", "name2": "bbb", "verdict": ["outlier"] * 3, "residual_deg": [0.05, 1.5, np.nan]}
     columns = {name: list(values) for name, values in told.items()}
-    assert contradicting(Rows(PairRow, 3, columns)).tolist() == [False, True, True]
+    assert contradicting(Table(PairRow, 3, columns)).tolist() == [False, True, True]
 
 
 def test_a_good_model_lists_no_task():
