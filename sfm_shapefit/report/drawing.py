@@ -1,6 +1,6 @@
 """The drawing of a result: cameras, pairs and points as plain arrays. Page and mesh share it.
 
-Table of `Cameras` and `Pairs` are those of cameras.csv and pairs.csv, in their order, so that a drawing can be
+Rows of `Cameras` and `Pairs` are those of cameras.csv and pairs.csv, in their order, so that a drawing can be
 made of a result in memory or of its files. Positions are in the output's units and axes; what has no
 position holds NaN. Bare graphs of two dimensions lie in the plane z = 0, of more than three dimensions the
 first three are drawn.
