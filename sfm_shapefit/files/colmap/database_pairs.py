@@ -43,7 +43,7 @@ class PairRows(NamedTuple):
     pairs: IntArray
     """(k, 2) images (i, j), i < j, by their place among the names; all else is (k,)."""
     rowids: IntArray
-    """Table of the table of geometries."""
+    """Rows of the table of geometries."""
     swapped: BoolArray
     """Whether the database has image j first."""
     num_inliers: IntArray
@@ -147,7 +147,7 @@ def match_names(file: DatabaseFile, names: Sequence[str]) -> dict[int, int]:
 def read_pairs(file: DatabaseFile, index_of_id: dict[int, int], damage: Damage) -> PairRows:
     """Read which pairs of the images that have an index have verified inlier matches.
 
-    Table that cannot be used are left aside.
+    Rows that cannot be used are left aside.
     """
     table = pair_table(file)
     config = _config(file, table)
