@@ -24,7 +24,7 @@ from sfm_shapefit.base.wording import label_lens
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
 from sfm_shapefit.judgement.limits import HALF, OUTNUMBERED, SIGMAS, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images, Pictures
-from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE
+from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE, Lens
 from sfm_shapefit.scene.points import Points
 
 # Change of the focal length, and standard deviations, beyond which that of one image is wrong, and beyond
@@ -54,10 +54,17 @@ class ContradictedLens(Record):
 
     @classmethod
     def of_lens(
-        cls, images: Images, row: int, factor: float, sigma: float, num_images: int, score: float
+        cls, lens: Lens, image: str, asked: tuple[float, float], num_images: int, score: float
     ) -> Self:
-        """Return the record of a lens, by its row, with what its images ask for."""
-        lens = images.lenses[row]
+        """Return the record of a lens, and the first of its images.
+
+        Args:
+            lens, image: the two.
+            asked: the factor of the focal length that its images ask for, and its standard deviation.
+            num_images: number of images that were asked.
+            score: the change in standard deviations.
+        """
+        factor, sigma = asked
         asked_px, remedy = factor * lens.focal_px, "intrinsics=focal lets it change, or calibrate that camera"
         if not lens.is_adjustable:
             remedy = f"{ADJUSTED_ELSEWHERE}; or calibrate that camera"
@@ -65,7 +72,7 @@ class ContradictedLens(Record):
             remedy = "it was adjusted already, so calibrate that camera"
         return cls(
             camera=lens.id,
-            image=images.names[int(np.argmax(images.lens_of == row))],
+            image=image,
             num_images=num_images,
             focal_px=lens.focal_px,
             asked_focal_px=asked_px,
@@ -176,7 +183,6 @@ def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[ContradictedLens, .
             sigma = SIGMA_PER_MEDIAN * float(np.median(np.abs(changes - middle)))
         score = float(np.median(scores[rows]))
         if np.median(np.abs(changes)) > least and score > deviations:
-            found.append(
-                ContradictedLens.of_lens(images, lens, float(np.exp(middle)), sigma, len(rows), score)
-            )
+            first, asked = images.names[int(np.argmax(own))], (float(np.exp(middle)), sigma)
+            found.append(ContradictedLens.of_lens(images.lenses[lens], first, asked, len(rows), score))
     return tuple(sorted(found, key=lambda item: -item.score))

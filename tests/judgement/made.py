@@ -14,9 +14,9 @@ def place_of(image: str, num_here: int = 5, num_there: int = 6, **more: Any) -> 
     return AmbiguousPlace(image=image, num_here=num_here, num_there=num_there, offset=(1.0, 1.0, 1.0), **more)
 
 
-def wrong_lens(lens: Lens) -> ContradictedLens:
+def wrong_lens(lens: Lens, image: str = "one.jpg") -> ContradictedLens:
     """A lens whose eight images ask for a longer focal length."""
-    return ContradictedLens.of_lens(lens, 1.2, 0.01, 8, 20.0)
+    return ContradictedLens.of_lens(lens, image, (1.2, 0.01), 8, 20.0)
 
 
 def group_apart(*images: str) -> GroupApart:

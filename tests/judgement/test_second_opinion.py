@@ -95,7 +95,7 @@ def test_a_camera_that_the_other_model_doubts_is_not_confirmed_by_it(images):
 @pytest.mark.parametrize(("wrong", "apart"), [([5], False), ([5, 6], True)])
 def test_a_single_camera_elsewhere_is_no_group_that_stands_apart(images, wrong, apart):
     second = compare(moved(images, wrong, shift=2.0), images, images)
-    assert second.wrong.tolist() == wrong
+    assert rows_of(images, second.wrong) == wrong
     said = [one.sentence for one in weigh_evidence(ModelEvidence(second=second), images)]
     assert any("stand apart from the rest" in sentence for sentence in said) == apart
 
