@@ -1,15 +1,17 @@
 """Scenes to be drawn, made without solving anything: a ring of cameras around points, some pairs wrong."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
-from sfm_shapefit.facts.model import EvidenceShares, ModelFacts, ModelInputs
-from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece, Solve
-from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow
+from sfm_shapefit.facts.model import ModelFacts, ModelInputs
+from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece
+from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow, Table
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
+from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.report.drawing import Poses, build_drawing
+from sfm_shapefit.solver.options import Solve
 
 UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7
 
@@ -35,7 +37,7 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
     ]
     pairs = [_pair(e, names, centers, rng) for e in range(num_pairs)]
     history = [(k, 0.02 + 0.5 * 0.3**k, 0.02 - 0.2 * 0.3**k) for k in range(1, 12)]
-    drawing = build_drawing(cameras, pairs, certified=centers + rng.normal(0, 0.01, centers.shape))
+    drawing = draw(cameras, pairs, certified=centers + rng.normal(0, 0.01, centers.shape))
     drawing = replace(drawing, history=tuple(history))
     halves = np.tile([0.6, 0.45], (num_cameras, 1))
     poses = Poses(
@@ -61,6 +63,24 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
     return replace(drawing, axes=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), frustum_depth=0.3), _facts(
         names
     )
+
+
+def table_of(rows, kind, dimension=3):
+    """Return rows as a table; an empty vector is one of which nothing is known."""
+    names = [item.name for item in fields(kind)]
+    columns = {name: [getattr(row, name) for row in rows] for name in names}
+    for values in columns.values():
+        width = max((len(value) for value in values if isinstance(value, tuple)), default=0)
+        values[:] = [(float("nan"),) * width if value == () else value for value in values]
+    known = {
+        name: values for name, values in columns.items() if name == names[0] or any(map(np.size, values))
+    }
+    return Table(kind, dimension, known)
+
+
+def draw(cameras, pairs, dimension=3, **more):
+    """Return the drawing of rows."""
+    return build_drawing(table_of(cameras, CameraRow, dimension), table_of(pairs, PairRow, dimension), **more)
 
 
 def _ring(n, rng):

@@ -1,7 +1,6 @@
 """The layers of the package: a module imports only those below it, and each heavy dependency has one door."""
 
 import ast
-from collections import Counter
 
 import pytest
 
@@ -12,31 +11,10 @@ from tests.program import run_python
 
 MOST_ARROWS = 75  # between rooms, beside those to base/; the list may only become shorter
 
-# Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
-# commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
-MOST_LINES = {
-    "adjustment": 4910,
-    "base": 2490,
-    "cli": 2040,
-    "facts": 3770,
-    "files": 8170,
-    "graph": 1380,
-    "judgement": 4730,
-    "laplacian": 2190,
-    "pairs": 1680,
-    "pipeline": 7840,
-    "placement": 3070,
-    "refinement": 2980,
-    "report": 1600,
-    "rotations": 2300,
-    "scene": 2730,
-    "solver": 4220,
-    "synthetic": 2640,
-    "synthetic/fixtures": 150,
-    "tracks": 1160,
-}
+# Lines of the package, docstrings and blank ones counted; who raises it says in the commit what they buy.
+MOST_LINES = 60_070
 MOST_LINES_OF_A_PAGE = 150  # of the pipeline of a command, so that its stages are seen at one glance
-SLACK_LINES = 40  # a budget further above its room than this is to be lowered
+SLACK_LINES = 300  # a budget further above the package than this is to be lowered
 
 DOORS = {
     "numba": {"base/jit.py", "base/kernel_cache.py", "base/kernel_code.py"},
@@ -78,14 +56,9 @@ def test_rooms_have_few_arrows():
     assert len({arrow for arrow in arrows() if "base" not in arrow}) <= MOST_ARROWS
 
 
-def test_each_room_keeps_within_its_budget_of_lines():
-    lines = Counter[str]()
-    for path in MODULES:
-        lines[room_of(path)] += len(path.read_text(encoding="utf-8").splitlines())
-    without = {room for room in ROOMS if room not in MOST_LINES}
-    assert without == {"__main__", "synthetic/fixtures"} - set(MOST_LINES)
-    assert {room: lines[room] for room, most in MOST_LINES.items() if lines[room] > most} == {}
-    assert {room: lines[room] for room, most in MOST_LINES.items() if lines[room] < most - SLACK_LINES} == {}
+def test_the_package_keeps_within_its_budget_of_lines():
+    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in MODULES)
+    assert MOST_LINES - SLACK_LINES <= lines <= MOST_LINES
 
 
 @pytest.mark.parametrize("command", ["check", "join", "locate", "map", "place"])

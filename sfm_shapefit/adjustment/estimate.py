@@ -2,15 +2,33 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.given_rotations import RotationErrors
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import LensErrors
+
+
+class BundleAdjustment(Record):
+    """What --adjust full reached; mean reprojection errors."""
+
+    converged: Annotated[bool, "Whether the last round met its tolerance."]
+    iterations: Annotated[int, "Steps of all rounds together."]
+    initial_error_px: Annotated[float, "At the seed's poses."]
+    final_error_px: Annotated[float, "At the adjusted poses."]
+
+    @property
+    def statement(self) -> str:
+        """How it went, in words."""
+        state = "converged" if self.converged else "stopped at its limit"
+        errors = f"{self.initial_error_px:.2f} -> {self.final_error_px:.2f} px"
+        return f"{state} after {self.iterations} steps, mean error {errors}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,14 +55,8 @@ class Estimate:
     sensor_sigmas: FloatArray
     """(l, 2) standard deviations of the sensors that were free in their rigs, see `judge_sensors`; NaN for
     the others."""
-    initial_error_px: float = math.nan
-    """Mean reprojection error at the poses of the start, of the points triangulated there."""
-    final_error_px: float = math.nan
-    """Mean reprojection error of the points of the answer."""
-    converged: bool = True
-    """Whether the last solve met its tolerance within its limit of 100 steps."""
-    iterations: int = 0
-    """Steps of all solves together."""
+    solves: BundleAdjustment
+    """How the solves went; the final error stands in it where the model's points are known."""
 
     @property
     def is_refined(self) -> BoolArray:

@@ -31,7 +31,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_shares
-from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.estimate import BundleAdjustment, Estimate
 from sfm_shapefit.adjustment.free_sensors import judge_sensors
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import RotationErrors
@@ -279,7 +279,7 @@ class AdjustmentRun:
 
         Args:
             last: the problem there.
-            errors, initial_error_px: see `Estimate`.
+            errors, initial_error_px: see `Estimate` and `BundleAdjustment`.
             judged: whether it is asked how well centers and sensors are known, which takes as long as steps.
         """
         run, known = self._center_errors(last) if judged else (self, None)
@@ -299,9 +299,12 @@ class AdjustmentRun:
             focal_sigmas=run.focal_sigmas,
             undetermined=self.undetermined,
             sensor_sigmas=judge_sensors(self.images, free, last, self.options_at_optimum()),
-            initial_error_px=initial_error_px,
-            converged=self.converged,
-            iterations=self.iterations,
+            solves=BundleAdjustment(
+                converged=self.converged,
+                iterations=self.iterations,
+                initial_error_px=initial_error_px,
+                final_error_px=math.nan,
+            ),
         )
 
     def _center_errors(self, problem: AdjustmentProblem) -> "tuple[AdjustmentRun, CenterErrors | None]":

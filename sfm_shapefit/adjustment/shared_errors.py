@@ -132,7 +132,9 @@ def estimate_center_errors(
         moves = same_scale if scale_sigma > METRIC_SIGMA else moves
     return CenterErrors(
         covariances=system.by_frame(moves @ moves.transpose(0, 2, 1)),
-        lens_errors=LensErrors(evidence, calibration_px, float(lens_errors_px.max(initial=0.0))),
+        lens_errors=LensErrors(
+            score=evidence, own_px=calibration_px, shared_px=float(lens_errors_px.max(initial=0.0))
+        ),
         scale_sigma=scale_sigma,
     )
 

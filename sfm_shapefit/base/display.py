@@ -4,6 +4,8 @@ Folders and reports are written by a layer above this one, which the package nam
 """
 
 import html
+import re
+import shlex
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
@@ -32,15 +34,20 @@ def row(label: str, text: str) -> Row:
 class NextStep(NamedTuple):
     """What to do next, and the command that does it.
 
-    In the command, {out} stands for the folder of the result, and {out_further} for one beside it.
+    In the command, {images} stands for the folder of the images, {out} for that of the result, and
+    {out_dense} for one beside it.
     """
 
     text: str
     command: str
 
-    def at(self, folder: str) -> "NextStep":
-        """Return the step for a model in a folder, which is quoted."""
-        return self._replace(command=self.command.format(out=folder, out_dense="dense"))
+    def at(self, **folders: Path | str) -> "NextStep":
+        """Return the step with some folders in place of the words that stand for them."""
+
+        def quoted(word: re.Match[str]) -> str:
+            return shlex.quote(str(folders[word[1]])) if word[1] in folders else word[0]
+
+        return self._replace(command=re.sub(r"\{(\w+)\}", quoted, self.command))
 
 
 class Telling(NamedTuple):

@@ -4,6 +4,7 @@ class Lud(Record):
     "The LUD start."
 
     iterations: Annotated[int, "Steps of the solver."]
+    costs: FloatArray    # without a sentence: not in the JSON, for those who compute with the record
 
 lud.summary()    # plain values, as they stand in JSON
 """
@@ -63,14 +64,21 @@ class Record:
 
     def summary(self) -> dict[str, Any]:
         """Return plain values, as they stand in JSON."""
-        return {item.name: plain(getattr(self, item.name)) for item in fields(self)}
+        return dict(plain(self))
+
+
+@cache
+def told_fields(kind: Any) -> tuple[str, ...]:
+    """Return the names of a dataclass's fields that stand in JSON: of a record those with a sentence."""
+    every = not issubclass(kind, Record)
+    return tuple(item.name for item in fields(kind) if every or get_origin(item.type) is Annotated)
 
 
 @cache
 def hints_of(kind: Any) -> dict[str, Any]:
-    """Return the types of a record's fields, with their sentences."""
+    """Return the types of the fields that stand in JSON, with their sentences."""
     hints = get_type_hints(kind, include_extras=True)
-    return {item.name: hints[item.name] for item in fields(kind)}
+    return {name: hints[name] for name in told_fields(kind)}
 
 
 def plain(value: Any) -> Any:
@@ -78,7 +86,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, enum.Enum):
         return value.value
     if is_dataclass(value) and not isinstance(value, type):
-        return {item.name: plain(getattr(value, item.name)) for item in fields(value)}
+        return {name: plain(getattr(value, name)) for name in told_fields(type(value))}
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

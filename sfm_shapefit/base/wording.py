@@ -58,8 +58,18 @@ def counted_are(number: int, noun: str) -> str:
     return f"{counted(number, noun)} {'is' if number == 1 else 'are'}"
 
 
+def stand(names: Sequence[str], what: str = "camera") -> str:
+    """Return the number of cameras, the names of the first and the verb that follows: stands for one."""
+    return f"{counted(len(names), what)} ({first_of(names)}) stand{'s' * (len(names) == 1)}"
+
+
 def rounded(value: float, smallest: float = 1e-9, digits: int = 4) -> str:
     """Return a number in so many digits; one that is smaller than `smallest` is 0."""
     if 10.0**digits <= abs(value) < 1e6:
         return f"{value:.0f}"  # no power of ten
     return "0" if abs(value) < smallest else f"{value:.{digits}g}"
+
+
+def label_lens(camera: int, image: str, num_images: int) -> str:
+    """Return a camera in COLMAP's sense by its id and one of its images, and how many others it took."""
+    return f"camera {camera} ({image}{f' and {num_images - 1:,} more' if num_images > 1 else ''})"

@@ -1,6 +1,5 @@
 """The frame of the commands that make OUT: it is claimed, errors are caught, progress and results shown."""
 
-import re
 import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -86,7 +85,8 @@ class Run(Generic[S]):
         print_answer(told._replace(rows=[*told.rows, row("colors", black)]), self.describe_time())
         opened = f"; open {first_of([*map(shlex.quote, pages)])}" if self.flags.report else ""
         images = self.flags.images if self._has_pictures(found.image_names) else ""
-        step = _with_folders(told.step.command, out / told.folders[0], images or "IMAGES")
+        model = out / told.folders[0]
+        step = told.step.at(out=model, out_dense=f"{model}_dense", images=images or "IMAGES").command
         print_ending(found.verdict.grade.value, found.verdict.statement, f"written to {out}/{opened}", step)
 
     def _has_pictures(self, names: Sequence[str]) -> bool:
@@ -101,12 +101,6 @@ class Run(Generic[S]):
         if compiling >= _NOTICED_S:
             total += f", of which {compiling:.0f} s compiling kernels, once"
         return total
-
-
-def _with_folders(command: str, out: Path, images: str) -> str:
-    """Return a command with the folders of the result and of the images filled in."""
-    command = command.replace(" IMAGES ", f" {shlex.quote(images)} ")
-    return re.sub(r"\{out(\w*)\}", lambda found: shlex.quote(f"{out}{found[1]}"), command)
 
 
 def refuse_swapped(source: Path, target: Path, order: str) -> None:

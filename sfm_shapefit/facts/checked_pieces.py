@@ -8,7 +8,6 @@ from typing import Annotated, Self
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.display import Displayed, NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
@@ -35,7 +34,7 @@ class CheckedPiece(Record):
     @classmethod
     def of_model(cls, folder: str, images: Images, facts: CheckedFacts) -> Self:
         """Return a model in a folder, of some images, with what `check` says of it."""
-        widths = _focal_widths(images)
+        widths = images.focal_widths
         return cls(folder=folder, focal_widths=(float(widths.min()), float(widths.max())), facts=facts)
 
     @property
@@ -84,11 +83,6 @@ class CheckedPieces(Record, Displayed, repr=False):
         return Telling(lines, rows, elsewhere="see --json", step=first)
 
 
-def _focal_widths(images: Images) -> FloatArray:
-    """Return the focal length of each image over the longer side of its picture, (i,)."""
-    return np.asarray(images.focal_lengths_px / images.sizes_px.max(axis=1))
-
-
 def _choose_kept(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -> Iterator[str]:
     """Yield the folders of the models to keep."""
     usable = [p for p in pieces if p.facts and p.facts.verdict.grade in (Grade.GOOD, Grade.LOOK)]
@@ -103,7 +97,7 @@ def _choose_kept(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -
 def _compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
     """Yield where models disagree on the focal length of one device."""
     names = [name for one in images.values() for name in one.names]
-    widths = np.concatenate([_focal_widths(one) for one in images.values()])
+    widths = np.concatenate([one.focal_widths for one in images.values()])
     model = np.repeat(np.arange(len(images)), [one.num_images for one in images.values()])
     for rows, _ in find_sequences(names):
         members = np.unique(model[rows])

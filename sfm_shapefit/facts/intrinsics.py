@@ -9,7 +9,7 @@ import numpy as np
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import first_of
+from sfm_shapefit.base.wording import first_of, label_lens
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE, Lens, Origin
 
@@ -150,11 +150,6 @@ def intrinsics_in_doubt(parts: BoolArray, by_view_graph: BoolArray) -> RefinedIn
     """Return what adjustments may change of lenses, their `PARTS` (l, p), before any of them."""
     unknown, nothing = np.full(len(parts), np.nan), np.zeros(len(parts), dtype=np.bool_)
     return RefinedIntrinsics(parts, by_view_graph, unknown, nothing)
-
-
-def label_lens(camera: int, image: str, num_images: int) -> str:
-    """Return a camera in COLMAP's sense by its id and one of its images, and how many others it took."""
-    return f"camera {camera} ({image}{f' and {num_images - 1:,} more' if num_images > 1 else ''})"
 
 
 def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:

@@ -5,17 +5,18 @@ Errors of a join come on top of those of its models, as if they moved each camer
     C' = s^2 R C R^T + sigma^2 / 3 I        sigma, the standard deviation of where its cameras come to lie
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.facts.rows import correlations_of, covariance_of
-from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.facts.rows import correlations_of, covariances_of
+from sfm_shapefit.facts.tables import CameraRow, Table
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 
 if TYPE_CHECKING:
@@ -34,24 +35,28 @@ class JoinedGroup(NamedTuple):
 
 
 def joined_camera_rows(
-    checked: Sequence[CameraRow], group: JoinedGroup, located: Mapping[int, LocateResult]
-) -> Iterator[CameraRow]:
-    """Yield the rows of the cameras that stand in the joined model, then those of the other images."""
+    checked: Table[CameraRow], group: JoinedGroup, located: Mapping[int, LocateResult]
+) -> Table[CameraRow]:
+    """Return the rows of the cameras that stand in the joined model, then those of the other images."""
     numbers = [number for number in group.world_from if number in located]
-    own = {row.name: (row, number) for number in reversed(numbers) for row in located[number].cameras}
-    variances = _variances_of_joins(group)
-    for seen in checked:
-        if not seen.placed or seen.name not in own:
-            yield seen
-            continue
-        row, number = own[seen.name]
-        sigma, correlation = _errors(row, group.world_from[number], variances[number])
-        reasons = [reason for reason in (row.reason, seen.reason) if reason]
-        yield replace(seen, reason="; ".join(reasons), trust=row.trust, sigma=sigma, correlation=correlation)
-    placed = {row.name for row in checked}
-    for name, (row, _) in own.items():
-        if name not in placed:
-            yield CameraRow(name=name, reason=row.reason, trust=row.trust)
+    own = {
+        name: (number, row)
+        for number in reversed(numbers)
+        for row, name in enumerate(located[number].cameras.columns["name"])
+    }
+    variances, columns = _variances_of_joins(group), {k: v.copy() for k, v in checked.columns.items()}
+    errors = {k: _errors(located[k].cameras, group.world_from[k], variances[k]) for k in numbers}
+    for row in np.flatnonzero(checked.columns["placed"]).tolist():
+        if (name := columns["name"][row]) in own:
+            number, source = own[name]
+            before = located[number].cameras[source]
+            columns["reason"][row] = "; ".join(filter(None, [before.reason, columns["reason"][row]]))
+            columns["trust"][row] = before.trust
+            columns["sigma"][row], columns["correlation"][row] = (part[source] for part in errors[number])
+    names = set(columns["name"])
+    others = [located[number].cameras[row] for name, (number, row) in own.items() if name not in names]
+    more = {name: [getattr(row, name) for row in others] for name in ("name", "reason", "trust")}
+    return checked.changed(columns).followed_by(Table(CameraRow, 3, more))
 
 
 def _variances_of_joins(group: JoinedGroup) -> dict[int, float]:
@@ -64,17 +69,16 @@ def _variances_of_joins(group: JoinedGroup) -> dict[int, float]:
     return found
 
 
-def _errors(
-    row: CameraRow, world_from: Similarity, variance: float
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return standard deviations and correlations of a center in the joined model; nothing if not known."""
-    own = covariance_of(row) if row.sigma else np.full((3, 3), np.nan)
-    if not np.isfinite(own).all():
-        return row.sigma, row.correlation
-    turned = world_from.scale**2 * world_from.rotation @ own @ world_from.rotation.T
-    covariance = (turned + variance * np.eye(3))[None]
-    sigmas = np.sqrt(np.diagonal(covariance[0]))
-    return tuple(sigmas.tolist()), tuple(correlations_of(covariance)[0].tolist())
+def _errors(rows: Table[CameraRow], world_from: Similarity, variance: float) -> tuple[FloatArray, FloatArray]:
+    """Return standard deviations and correlations (n, 3) of centers in the joined model, where known."""
+    own = covariances_of(rows)
+    known = np.isfinite(own).all(axis=(1, 2))
+    turned = world_from.scale**2 * world_from.rotation @ own[known] @ world_from.rotation.T
+    covariances = turned + variance * np.eye(3)
+    sigmas, correlations = rows.columns["sigma"].copy(), rows.columns["correlation"].copy()
+    sigmas[known] = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    correlations[known] = correlations_of(covariances)
+    return sigmas, correlations
 
 
 def joined_verdict(

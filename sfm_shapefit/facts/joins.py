@@ -6,8 +6,8 @@ from typing import Annotated
 from sfm_shapefit.base.geometry import Alignment
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.facts.placed import Solve
 from sfm_shapefit.placement.join import PieceJoin
+from sfm_shapefit.solver.options import Solve
 
 
 class JoinFacts(Record):
@@ -84,7 +84,7 @@ class Joined:
             folder=folder,
             statement=self.statement,
             similarity=found and found.to_from_piece.facts,
-            solve=solved and Solve(**solved.summary()),
+            solve=solved and solved.facts,
             agreeing_pairs=0 if found is None else len(found.agreeing),
             contradicting_pairs=0 if found is None else len(found.contradicting),
             rival_pairs=list(self.rivals),

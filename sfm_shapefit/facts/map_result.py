@@ -16,7 +16,6 @@ from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted, reasons_by_place
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.model import (
-    Averaging,
     Component,
     DatabaseInputs,
     JoinedFacts,
@@ -25,7 +24,7 @@ from sfm_shapefit.facts.model import (
 )
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Tabled
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table, Tabled
 from sfm_shapefit.judgement.grade import FEW_PLACED, in_another_model
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -44,9 +43,9 @@ class JoinedModel(Written, Stated):
     """Their numbers; the world is that of the first, scaled if known distances between them give a scale."""
     joins: tuple[Joined, ...]
     """What came of joining each model to another, those included that are not in this one."""
-    cameras: Sequence[CameraRow]
+    cameras: Table[CameraRow]
     """One row per image of these models."""
-    pairs: Sequence[PairRow]
+    pairs: Table[PairRow]
     """One row per pair of these that was looked at."""
     facts: JoinedFacts
     """What stands in its locate.json."""
@@ -59,7 +58,7 @@ class JoinedModel(Written, Stated):
     @property
     def image_names(self) -> tuple[str, ...]:
         """Names of its images."""
-        return tuple(row.name for row in self.cameras)
+        return tuple(self.cameras.columns["name"])
 
     @property
     def told(self) -> Telling:
@@ -143,7 +142,7 @@ class MapResult(Written, Tabled):
                     folder=str(number),
                     num_images=len(model.averaged_names),
                     num_placed=int(model.kept.sum()),
-                    averaging=Averaging(**_averaging_of(model).summary()),
+                    averaging=_averaging_of(model).facts,
                     located=model.facts,
                 )
                 for number, model in enumerate(self.models)

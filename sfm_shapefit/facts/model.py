@@ -12,13 +12,12 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 
-from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.estimate import BundleAdjustment, Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
-from sfm_shapefit.facts.evidence import ToldEvidence, ToldOpinion
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics, describe_intrinsics
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.placed import (
@@ -33,19 +32,18 @@ from sfm_shapefit.facts.placed import (
     Warnings,
 )
 from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
-from sfm_shapefit.facts.scene import DistanceFacts, Loop, describe_line, describe_loops
-from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.facts.scene import DistanceFacts, describe_line, describe_loops
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, Kind
+from sfm_shapefit.judgement.second_opinion import SecondOpinion
+from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.placement.place import Placement
-
-
-class EarthDatum(Record):
-    """A point on the WGS84 ellipsoid: the origin of axes east, north and up, in meters."""
-
-    latitude_deg: Annotated[float, "Geodetic latitude."]
-    longitude_deg: Annotated[float, "Longitude, east of Greenwich."]
-    altitude_m: Annotated[float, "Height above the ellipsoid, or what the priors give for it."]
+from sfm_shapefit.rotations.averaged import Averaging
+from sfm_shapefit.rotations.sequences import Loop
+from sfm_shapefit.scene.given import EarthDatum
+from sfm_shapefit.scene.lens import LensErrors
 
 
 class ModelInputs(InputFacts):
@@ -64,25 +62,6 @@ class ModelInputs(InputFacts):
     def database_flag(self) -> str:
         """How a command is given the database, after a space; empty without one."""
         return f" --database {shlex.quote(_from_here(self.database))}" if self.database else ""
-
-
-class EvidenceShares(Record):
-    """What share of the evidence agrees with the cameras and points of the output."""
-
-    pairs: Annotated[
-        float | None,
-        "Share of the pairs of its cameras that say anything of a direction; null where none does.",
-    ]
-    observations: Annotated[
-        float | None,
-        "Share that sees a 3D point, of the keypoints matched in two or more of its other images; null "
-        "without a database.",
-    ]
-    contradicting: Annotated[
-        float | None,
-        "Share that sees none and most of whose matches miss the epipolar lines of the cameras, of the "
-        "same keypoints.",
-    ]
 
 
 class PlacementAdjustment(Record):
@@ -110,18 +89,6 @@ class PlacementAdjustment(Record):
             rotation_sigma_deg=None if held or free else math.degrees(sigma_rad),
             chance_deg=None if errors is None else math.degrees(errors.chance_rad),
         )
-
-
-class LensErrorFacts(Record):
-    """What the standard deviations take smooth errors of the lenses for, by what the residuals say."""
-
-    score: Annotated[
-        float,
-        "Standard score of errors that all images of a lens share, the largest; up to 3 they are noise, "
-        "from 4 on they count in full.",
-    ]
-    own_px: Annotated[float, "Errors of an image of its own, root of the mean square in pixels; 0 if none."]
-    shared_px: Annotated[float, "The same of errors that all images of a lens share."]
 
 
 class RotationRefinement(Record):
@@ -152,22 +119,6 @@ class RotationRefinement(Record):
             median_change_deg=float(np.median(changed)) if len(changed) else 0.0,
             max_change_deg=float(changed.max(initial=0.0)),
         )
-
-
-class BundleAdjustment(Record):
-    """What --adjust full reached; mean reprojection errors."""
-
-    converged: Annotated[bool, "Whether the last round met its tolerance."]
-    iterations: Annotated[int, "Steps of all rounds together."]
-    initial_error_px: Annotated[float, "At the seed's poses."]
-    final_error_px: Annotated[float, "At the adjusted poses."]
-
-    @property
-    def statement(self) -> str:
-        """How it went, in words."""
-        state = "converged" if self.converged else "stopped at its limit"
-        errors = f"{self.initial_error_px:.2f} -> {self.final_error_px:.2f} px"
-        return f"{state} after {self.iterations} steps, mean error {errors}"
 
 
 class GroupFacts(Record):
@@ -212,7 +163,7 @@ class FactsOfModel(Facts):
         float | None, "Mean reprojection error of these points; null if there are none."
     ]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
-    evidence: Annotated[ToldEvidence, "What speaks against the model although it fits."] = ToldEvidence()
+    evidence: Annotated[ModelEvidence, "What speaks against the model although it fits."] = ModelEvidence()
 
     def told_lines(self, against: tuple[int, int], more: str = "") -> list[str]:
         """Return the answer in lines: how many pairs are `against` it, of how many, and `more` of matches."""
@@ -279,7 +230,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     loops: Annotated[tuple[Loop, ...], "Loops of the videos among the images of `map`."]
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
     lens_errors: Annotated[
-        LensErrorFacts | None, "Null where the standard deviations know of matching noise only."
+        LensErrors | None, "Null where the standard deviations know of matching noise only."
     ]
     rotation_refinement: Annotated[RotationRefinement | None, "Null if nothing was adjusted."]
     bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
@@ -354,7 +305,12 @@ def next_of_model(grade: Grade, facts: FactsOfModel) -> NextStep:
         return NextStep("Next: find out what is wrong with the input.", step)
     looked = ", once you have looked" if grade is Grade.LOOK else ""
     text = f"Next: undistort the images for splatting or dense reconstruction{looked}."
-    return NextStep(text, "sfm-shapefit workspace {out} IMAGES {out_dense}")
+    return NextStep(text, "sfm-shapefit workspace {out} {images} {out_dense}")
+
+
+def _next_in(folder: str, grade: Grade, facts: FactsOfModel) -> NextStep:
+    """Return what to do with a model that was only looked at, in its folder."""
+    return next_of_model(grade, facts).at(out=folder, out_dense="dense")
 
 
 def _from_here(path: str) -> str:
@@ -376,9 +332,7 @@ class CheckedFacts(FactsOfModel):
     @property
     def next_step(self) -> NextStep:
         """What to do next, with the folder of the pictures where it is known."""
-        step = self._next()
-        images = shlex.quote(_from_here(self.images)) if self.images else "IMAGES"
-        return step._replace(command=step.command.replace(" IMAGES", f" {images}"))
+        return self._next().at(images=_from_here(self.images) if self.images else "IMAGES")
 
     def _next(self) -> NextStep:
         """Return what to do next, by the verdict and by what was asked."""
@@ -386,7 +340,7 @@ class CheckedFacts(FactsOfModel):
         is_alike = second is not None and second.is_alike
         is_sound = verdict.grade is Grade.GOOD or (verdict.grade is Grade.LOOK and is_alike)
         if is_sound and self.num_points:  # poses alone, as of a list, are to be placed with points
-            return next_of_model(verdict.grade, self).at(path)
+            return _next_in(self.inputs.path, verdict.grade, self)
         if (
             second is not None
             and not is_alike
@@ -408,16 +362,15 @@ class CheckedFacts(FactsOfModel):
         """Return how to get more evidence: from photographs, or from all pairs of them if asked."""
         if self.images:
             text = "Next: match all its photographs, and place them anew."
-            return NextStep(text, "sfm-shapefit map IMAGES mapped")
+            return NextStep(text, "sfm-shapefit map {images} mapped")
         text = "Next: check it against its photographs, or the database that it was made from (--database)."
-        return NextStep(text, f"sfm-shapefit check {path} --images IMAGES")
+        return NextStep(text, f"sfm-shapefit check {path} --images {{images}}")
 
-    def _next_of_map(self, second: ToldOpinion) -> NextStep:
+    def _next_of_map(self, second: SecondOpinion) -> NextStep:
         """Return how to take the model that `map` makes of the database: the one that was kept, or anew."""
         why = "; pairs support it" if second.wrong else ""
         if self.second_opinion:
-            kept = shlex.quote(f"{self.second_opinion}/{second.folder}")
-            step = next_of_model(second.grade, self).at(kept)
+            step = _next_in(f"{self.second_opinion}/{second.folder}", second.grade, self)
             return step._replace(text=f"Next: take the model that map made of the database{why}.")
         command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
         return NextStep(f"Next: take the model that map makes of the database{why}.", command)
@@ -429,16 +382,16 @@ class CheckedFacts(FactsOfModel):
             command = f"sfm-shapefit locate {path} located --intrinsics all{self.inputs.database_flag}"
             return NextStep(text, command)
         text = "Next: give all images of a device one lens, and reconstruct them again."
-        return NextStep(text, "sfm-shapefit map IMAGES mapped")
+        return NextStep(text, "sfm-shapefit map {images} mapped")
 
-    def told(self, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Telling:
+    def told(self, cameras: Table[CameraRow], pairs: Table[PairRow]) -> Telling:
         """Return what the terminal says, of cameras what is weak about them."""
         # One that the second opinion confirms is not told, whatever its weakness.
         doubted = (row for row in cameras if row.placed and row.name in self.verdict.cameras)
         weak = [f"{row.name}: {row.reason}" for row in doubted if row.reason]
         absent = first_of([row.name for row in cameras if not row.placed])
-        judged = [pair for pair in pairs if pair.direction]  # the others say nothing of positions
-        lines = self.told_lines((sum(pair.contradicts for pair in judged), len(judged)))[:2]
+        judged = np.isfinite(pairs.columns["direction"]).all(axis=1)  # the others say nothing of positions
+        lines = self.told_lines((int(np.sum(contradicting(pairs) & judged)), int(judged.sum())))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
         notes = Row("warning", [one for one in self.warnings if one not in self.evidence.statements])
         rows = [Row("weak", weak), row("without a pose", absent), second, notes]
@@ -470,26 +423,6 @@ class DatabaseInputs(Record):
     """What `map` worked from."""
 
     database: Annotated[str, "The database's path."]
-
-
-class Averaging(Record):
-    """How rotations were averaged, and how well they agree with the pairs."""
-
-    statement: Annotated[str, "How the rotations were found, in words."]
-    num_registered: Annotated[int, "Images that have a rotation."]
-    num_pairs: Annotated[int, "Pairs whose residuals count."]
-    agreeing_share: Annotated[float, "Share of the pairs, by the square root of their matches, that agree."]
-    num_unsettled: Annotated[int, "Images that most of their pairs contradict, in every answer tried."]
-    median_sigma_deg: Annotated[float | None, "Median standard deviation of a rotation; null if not known."]
-    num_tried: Annotated[int, "Averagings of which this one is the most consistent."]
-    certified: Annotated[
-        bool | None, "Whether no rotations fit the kept pairs better; null if that was not checked."
-    ]
-    num_repeated_pairs: Annotated[
-        int,
-        "Pairs set aside since they would fold the images together, and lack matches that they should share.",
-    ]
-    num_rival_pairs: Annotated[int, "Pairs of another arrangement of the images that is as likely."]
 
 
 class Component(Record):

@@ -20,12 +20,13 @@ from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.geometry import extent_of, fit_similarity_l1, median_spread
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded
-from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.facts.tables import CameraRow, Table
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.placement.place import Placement, count_large
 from sfm_shapefit.refinement.starts import RefinedPlacement
-from sfm_shapefit.solver.options import Status
+from sfm_shapefit.solver.options import Solve, Status
+from sfm_shapefit.solver.splitting.lud import Lud
 
 UNITS = {
     "input": "of the input's units",
@@ -77,7 +78,7 @@ class KeyFigures(Record):
 
     @classmethod
     def of_cameras(
-        cls, cameras: Sequence[CameraRow], pair_error_deg: float | None, focal_length_px: float, unit: str
+        cls, cameras: Table[CameraRow], pair_error_deg: float | None, focal_length_px: float, unit: str
     ) -> Self:
         """Return the figures of placed cameras.
 
@@ -88,11 +89,11 @@ class KeyFigures(Record):
                 them; NaN for a bare graph.
             unit: what positions are given in, one of `UNITS` or `SOLVER_UNITS`.
         """
-        placed = [camera for camera in cameras if camera.placed]
-        centers = np.array([camera.center for camera in placed if camera.center])
+        placed, centers, sigmas = (cameras.columns[name] for name in ("placed", "center", "sigma"))
+        centers = centers[placed & np.isfinite(centers).all(axis=1)]
         extent = extent_of(centers) if len(centers) else 0.0
-        known = [max(camera.sigma) for camera in placed if camera.sigma and max(camera.sigma) > 0.0]
-        sigma = float(np.median(known)) if known else math.nan
+        known = sigmas[placed].max(axis=1)
+        sigma = float(np.median(known[known > 0.0])) if (known > 0.0).any() else math.nan
         sigma = sigma if math.isfinite(sigma) else math.nan
         error_deg = math.nan if pair_error_deg is None else pair_error_deg
         return cls(
@@ -221,32 +222,6 @@ class Delivered(Record):
         )
 
 
-class Solve(Record):
-    """A certified ShapeFit solve: of the largest piece, or over pieces that are joined."""
-
-    status: Annotated[str, "converged, inaccurate, max_iterations or cancelled."]
-    objective: Annotated[float | None, "R(T) / L(T) of the paper at the ShapeFit optimum, dimensionless."]
-    dual_bound: Annotated[float | None, "No placement has a lower objective."]
-    gap: Annotated[float | None, "objective - dual_bound."]
-    equality_residual: Annotated[
-        float | None, "Violation of the dual's equality, relative to the largest weighted degree."
-    ]
-    unique: Annotated[bool | None, "Whether the certificate proves the optimum unique; null if not examined."]
-    iterations: Annotated[int, "Iterations of the solver that ran."]
-    seconds: Annotated[float, "Wall-clock time of the solve."]
-    method: Annotated[str, "The solver that ran."]
-    method_reason: Annotated[str, "Why it was chosen."]
-
-
-class Lud(Record):
-    """The LUD start and its own dual bound, in its own units."""
-
-    objective: Annotated[float, "Value of the LUD program at its start."]
-    dual_bound: Annotated[float | None, "No placement has a lower objective."]
-    equality_residual: Annotated[float | None, "Violation of the dual's equality, as in `Solve`."]
-    iterations: Annotated[int, "Iterations of its solver."]
-
-
 class Finish(Record):
     """From the certified optimum to the centers."""
 
@@ -284,8 +259,7 @@ class Finish(Record):
             moved_median=refined.moved[0],
             moved_max=refined.moved[1],
             num_put_back=len(refined.reset_nodes),
-            lud=Lud.of(refined.lud),
-            reweighted=refined.reweighted and Solve(**refined.reweighted.solved.summary()),
+            reweighted=refined.reweighted and refined.reweighted.solved.facts,
         )
 
 
@@ -366,7 +340,7 @@ class PlacedFacts(Facts):
 
 def facts_of_placement(
     placement: Judged,
-    cameras: Sequence[CameraRow],
+    cameras: Table[CameraRow],
     solved: Iterable[tuple[int, str, int]],
     measures: tuple[float, str],
 ) -> dict[str, Any]:
@@ -393,7 +367,7 @@ def facts_of_placement(
             for group in placement.assessment.loose_groups
         ],
         "pieces": pieces_of(placement, solved),
-        "solve": Solve(**placement.certified.summary()),
+        "solve": placement.certified.facts,
         "finish": Finish.of_placement(placement.refined),
         "versions": {"sfm_shapefit": __version__} | {name: version(name) for name in others},
     }

@@ -15,15 +15,10 @@ from sfm_shapefit.base.display import Telling, Written, report_in_notebook
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted, reasons_by_place
 from sfm_shapefit.facts.control_points import ControlPoint
-from sfm_shapefit.facts.evidence import ToldEvidence, tell_evidence
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.model import (
-    BundleAdjustment,
-    EarthDatum,
-    EvidenceShares,
     GroupFacts,
-    LensErrorFacts,
     ModelFacts,
     ModelInputs,
     PlacementAdjustment,
@@ -37,15 +32,14 @@ from sfm_shapefit.facts.placed import (
     Delivered,
     GraphFacts,
     GraphInputs,
-    Solve,
     TakenForRight,
     facts_of_placement,
 )
 from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
-from sfm_shapefit.facts.scene import Loop, told_distances
-from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow, Tabled
+from sfm_shapefit.facts.scene import told_distances
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, Tabled
 from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import Shares, judge_model, too_few_to_judge, weigh_evidence
@@ -53,16 +47,17 @@ from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.straight import find_line, sigma_along
-from sfm_shapefit.judgement.support import ObservationShares
+from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
-from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.placement.right_pairs import RightPairs, examine_right_pairs
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.sequences import Loop
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
 from sfm_shapefit.solver.options import SolverResult
@@ -134,7 +129,7 @@ class _Placed(Written, Tabled):
     @property
     def told(self: Any) -> Telling:
         """What the terminal says."""
-        left_out = reasons_by_place(self.not_placed, [row.name for row in self.cameras])
+        left_out = reasons_by_place(self.not_placed, self.cameras.columns["name"].tolist())
         told: Telling = self.facts.told(left_out, self.placement.refined.statement())
         return told
 
@@ -143,8 +138,9 @@ class _Placed(Written, Tabled):
         """Name and reason of each camera that is placed neither here nor in another model of `map`."""
         elsewhere = getattr(self, "elsewhere", None)
         others = set() if elsewhere is None else {*np.array(self.images.names)[elsewhere].tolist()}
-        left_out = (row for row in self.cameras if not row.placed and row.name not in others)
-        return {row.name: row.reason for row in left_out}
+        names, placed, reasons = (self.cameras.columns[name] for name in ("name", "placed", "reason"))
+        left_out = zip(names[~placed], reasons[~placed], strict=True)
+        return {name: reason for name, reason in left_out if name not in others}
 
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
@@ -220,10 +216,10 @@ class LocateResult(_Placed):
     unsupported: BoolArray
     """(n,) images hardly any of whose matches makes a point with a third image; left out too, unless the
     least trust is 0."""
-    observations: ObservationShares
-    """Shares of keypoints that agree and contradict; NaN where there is no database."""
+    observations: EvidenceShares
+    """Shares of keypoints that agree and contradict; None where there is no database."""
     evidence: ModelEvidence = field(default_factory=ModelEvidence)
-    """What speaks against it although it fits, by images of it."""
+    """What speaks against it although it fits."""
 
     intrinsics: RefinedIntrinsics
     """What became of the lenses that were in doubt."""
@@ -276,11 +272,7 @@ class LocateResult(_Placed):
             pairs={status.name.lower(): count for status, count in self.directions.counts().items()}
             | {"outlier": len(placement.rejected_pairs)},
             num_contradicting=placement.num_contradicting,
-            agreement=EvidenceShares(
-                pairs=self.agreeing_pairs,
-                observations=self.observations.agreeing,
-                contradicting=self.observations.contradicting,
-            ),
+            agreement=replace(self.observations, pairs=self.agreeing_pairs),
             num_points=model.num_points3D(),
             mean_reprojection_error_px=model.compute_mean_reprojection_error(),
             num_points_as_nodes=int(np.sum(placement.nodes >= placement.num_cameras)),
@@ -288,26 +280,20 @@ class LocateResult(_Placed):
             scale_sigma=gauge.scale_sigma,
             known_distances=told_distances(self.distances, self.placed),
             wrong_priors=self._wrong_priors(),
-            datum=EarthDatum.of(gauge.datum),
+            datum=gauge.datum,
             rigid_groups=GroupFacts.of_placement(placement, self.kept, self.fixed),
             intrinsics=tuple(self.intrinsics.rows(self.placed)),
-            evidence=self.told_evidence,
             refined_rigs=self.rigs,
             num_doubtful_pairs=len(self.doubtful_pairs),
             adjustment=PlacementAdjustment.of_estimate(self.adjustment),
-            lens_errors=placement.lens_errors and LensErrorFacts(**placement.lens_errors._asdict()),
+            lens_errors=placement.lens_errors,
             rotation_refinement=RotationRefinement.of_turns(self.turned_deg),
-            bundle_adjustment=BundleAdjustment.of(self.adjusted),
+            bundle_adjustment=self.adjusted and self.adjusted.solves,
         )
 
     def _headline(self) -> str:
         images = f"{self.model.num_reg_images()} of {len(self.image_names)} images placed"
         return f"{self.verdict.grade.value}: {images}, {counted(self.model.num_points3D(), 'point')}"
-
-    @property
-    def told_evidence(self) -> ToldEvidence:
-        """What speaks against it although it fits, by name."""
-        return tell_evidence(self.evidence, self.placed, self.gauge.similarity.scale, self.gauge.axes)
 
     @property
     def delivered(self) -> Delivered:
@@ -319,7 +305,7 @@ class LocateResult(_Placed):
         """Whether the model can be used, and why."""
         is_posed, elsewhere = self.placed.is_posed, self.elsewhere
         shares = Shares(
-            self.observations.contradicting,
+            self.observations.contradicting or 0.0,
             placed=float(np.mean(is_posed if elsewhere is None else is_posed[~elsewhere])),
             placed_here=float(np.mean(is_posed)),
         )
@@ -360,33 +346,33 @@ class LocateResult(_Placed):
         return centers
 
     @cached_property
-    def cameras(self) -> list[CameraRow]:
+    def cameras(self) -> Table[CameraRow]:
         """One row per image of the input: the posed ones by id, then those without a rotation."""
-        scale, solved_pieces = self.gauge.similarity.scale, [piece.placement for piece in self.further]
-        rows = camera_rows(self.placement, self._centers, scale, solved_pieces, self.gauge.axes)
-        for camera, reason in without_direction(self.directions, self.placement.graph).items():
-            rows[camera] = replace(rows[camera], reason=reason)
-        for camera, center in self._carried().items():
-            is_fixed = self.fixed is not None and self.fixed[camera]
-            reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
-            rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
+        pieces, cameras = [piece.placement for piece in self.further], self.placement.graph
+        rows = camera_rows(
+            self.placement, self._centers, self.gauge.similarity.scale, pieces, self.gauge.axes
+        )
+        reasons = rows.columns["reason"]
+        for camera, reason in without_direction(self.directions, cameras).items():
+            reasons[camera] = reason
+        carried = self._carried()
+        rows.columns["placed"][carried], rows.columns["piece"][carried] = True, 0
+        rows.columns["center"][carried] = self.placed.centers[carried]
+        fixed = np.zeros(len(rows), dtype=np.bool_) if self.fixed is None else self.fixed
+        reasons[carried] = np.where(fixed[carried], CARRIED_FIXED, CARRIED_BY_FRAME)
         for camera, count in self.few_points.items():
-            reason = (
-                f"it sees {counted(count, 'point')}, fewer than {self.options.structure.min_points_per_image}"
-            )
-            rows[camera] = replace(rows[camera], reason=reason)
-        for camera in self.cameras_without_support:
-            rows[camera] = replace(rows[camera], reason=NO_SUPPORT)
+            least = self.options.structure.min_points_per_image
+            reasons[camera] = f"it sees {counted(count, 'point')}, fewer than {least}"
+        reasons[self.cameras_without_support] = NO_SUPPORT
         off = self.prior_fit and self.prior_fit.off
-        for name, values in (("turned_deg", self.turned_deg), ("moved", self.moved), ("prior_off", off)):
-            if values is not None:
-                both = zip(rows, values.tolist(), strict=True)
-                rows = [replace(row, **{name: value}) for row, value in both]
+        told = {"turned_deg": self.turned_deg, "moved": self.moved, "prior_off": off}
+        rows = rows.changed({name: values for name, values in told.items() if values is not None})
         unposed = sorted(set(self.image_names) - set(self.images.names))
-        return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
+        why = ["the input has no rotation for it"] * len(unposed)
+        return rows.followed_by(Table(CameraRow, rows.dimension, {"name": unposed, "reason": why}))
 
     @cached_property
-    def own_cameras(self) -> list[CameraRow]:
+    def own_cameras(self) -> Table[CameraRow]:
         """One row per camera of the piece that is placed."""
         return own_camera_rows(self.placement, self._centers, self.gauge.similarity.scale)
 
@@ -430,43 +416,37 @@ class LocateResult(_Placed):
         fit = self.prior_fit
         return {} if fit is None else {self.images.names[k]: float(fit.off[k]) for k in fit.wrong.tolist()}
 
-    def _carried(self) -> dict[int, tuple[float, ...]]:
-        """Return the centers of images in the output that no pair placed: fixed ones, and rest of a frame."""
+    def _carried(self) -> IntArray:
+        """Return the images in the output that no pair placed: fixed ones, and rest of a frame, rows (k,)."""
         carried = self.placed.is_posed
         carried[self.placement.cameras[self.kept]] = False
-        rows = np.flatnonzero(carried).tolist()
-        return dict(zip(rows, map(tuple, self.placed.centers[carried].tolist()), strict=True))
+        return np.flatnonzero(carried)
 
     @cached_property
-    def pairs(self) -> list[PairRow]:
+    def pairs(self) -> Table[PairRow]:
         """One row per pair that was looked at, usable or not, in the order of pairs."""
-        columns: dict[str, FloatArray] = {}
+        more: dict[str, FloatArray] = {}
         if self.scores is not None:
-            columns |= {"triplet_score": self.scores[:, 0], "matched_share": self.scores[:, 1]}
-            columns["pair_score"] = score_pairs(*self.scores.T)
-        added = zip(*(column.tolist() for column in columns.values()), strict=True)
-        scores = [MethodScores(**dict(zip(columns, values, strict=True))) for values in added]
-        scores = scores or [MethodScores()] * len(self.directions.pairs)
+            more |= {"triplet_score": self.scores[:, 0], "matched_share": self.scores[:, 1]}
+            more["pair_score"] = score_pairs(*self.scores.T)
+        if self.prior_fit is not None:
+            more["prior_angle_deg"] = self.prior_fit.angles_deg
         usable, names, axes = self.directions.usable(), self.images.names, self.gauge.axes
-        further = [piece.placement for piece in self.further]
-        support = self.directions.num_inliers[usable]
-        of_usable = iter(pair_rows(self.placement, support, further, [scores[k] for k in usable.tolist()]))
-        rows = [
-            _turn(next(of_usable), axes)
-            if status is DirectionStatus.USABLE
-            else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value, scores=given)
-            for (i, j), status, support, given in zip(
-                self.directions.pairs.tolist(),
-                self.directions.status,
-                self.directions.num_inliers.tolist(),
-                scores,
-                strict=True,
-            )
-        ]
-        if self.prior_fit is None:
-            return rows
-        angles = self.prior_fit.angles_deg.tolist()
-        return [replace(row, prior_angle_deg=angle) for row, angle in zip(rows, angles, strict=True)]
+        ends, support = self.directions.pairs, self.directions.num_inliers
+        columns = {
+            "name1": [names[i] for i in ends[:, 0].tolist()],
+            "name2": [names[j] for j in ends[:, 1].tolist()],
+            "support": support,
+            "reason": [status.value for status in self.directions.status],
+        }
+        rows = Table(PairRow, self.dimension, columns | more)
+        judged = pair_rows(self.placement, support[usable], [piece.placement for piece in self.further])
+        for name in judged.columns.keys() - more.keys() - {"name1", "name2", "support"}:
+            rows.columns[name][usable] = judged.columns[name]
+        if axes is not None:
+            turned = [axes @ direction for direction in judged.columns["direction"]]
+            rows.columns["direction"][usable] = np.reshape(turned, (-1, self.dimension))
+        return rows
 
     @cached_property
     def line_sigma(self) -> float | None:
@@ -482,16 +462,13 @@ class LocateResult(_Placed):
         return sigma if math.isfinite(sigma) else None
 
     @cached_property
-    def doubtful_pairs(self) -> list[PairRow]:
+    def doubtful_pairs(self) -> Table[PairRow]:
         """The pairs that agree with the model and look like repeated structure all the same, worst first."""
-        doubtful = doubtful_pairs(np.array([row.scores.pair_score for row in self.pairs])).tolist()
-        rows = [row for row, is_doubtful in zip(self.pairs, doubtful, strict=True) if is_doubtful]
-        used = [row for row in rows if row.verdict == Verdict.INLIER.value]
-        return sorted(used, key=lambda row: (row.scores.pair_score, row.name1, row.name2))
-
-
-def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
-    return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
+        columns = self.pairs.columns
+        used = columns["verdict"] == Verdict.INLIER.value
+        rows = np.flatnonzero(doubtful_pairs(columns["pair_score"]) & used).tolist()
+        order = [columns[name] for name in ("pair_score", "name1", "name2")]
+        return self.pairs.taken(sorted(rows, key=lambda row: tuple(column[row] for column in order)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -531,7 +508,7 @@ class GraphResult(_Placed):
                 num_right=len(right.edges),
                 num_fixed=right.num_fixed,
                 rigid=right.is_rigid,
-                solve=None if right.solved is None else Solve(**right.solved.summary()),
+                solve=None if right.solved is None else right.solved.facts,
             ),
         )
 
@@ -560,12 +537,12 @@ class GraphResult(_Placed):
         return self.placement.warnings
 
     @cached_property
-    def cameras(self) -> list[CameraRow]:
+    def cameras(self) -> Table[CameraRow]:
         """One row per node."""
         return camera_rows(self.placement, self.placement.locations, 1.0, self.further)
 
     @cached_property
-    def pairs(self) -> list[PairRow]:
+    def pairs(self) -> Table[PairRow]:
         """One row per edge."""
         support = np.zeros(self.placement.num_pairs, dtype=np.int64)
         return pair_rows(self.placement, support, self.further)

@@ -2,19 +2,16 @@
 
 import csv
 import io
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.placed import folder_of
-from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow, name_in, write_csv
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, name_in, write_csv
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.rigidity import left_out_reasons
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -27,7 +24,6 @@ from sfm_shapefit.placement.place import count_large
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
 _ELSEWHERE = "in a larger piece, to which this one is not rigidly tied"
 _OUTSIDE = "outside the pieces that are solved"
-_NOT_JUDGED = (Verdict.UNDETERMINED, *4 * (math.nan,))
 _INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
 
 
@@ -37,7 +33,7 @@ def camera_rows(
     scale: float,
     further: Sequence[Judged] = (),
     axes: FloatArray | None = None,
-) -> list[CameraRow]:
+) -> Table[CameraRow]:
     """Return one row per camera of a placed graph.
 
     Args:
@@ -48,7 +44,7 @@ def camera_rows(
         further: the other pieces that are solved; the rows of their cameras say where they stand.
         axes: (d, d) rotation from the input's axes to the output's; the same if None.
     """
-    graph = placement.graph
+    graph, cameras = placement.graph, range(placement.num_cameras)
     # Each camera's home is the first piece of three cameras or more that holds it, or the largest.
     homes: list[int | None] = [None] * graph.num_nodes
     for k in reversed(range(max(count_large(placement.pieces, placement.measured), 1))):
@@ -64,49 +60,46 @@ def camera_rows(
         for camera, names in folders.items()
         if camera in reasons
     }
-    degrees = np.bincount(graph.edges[: placement.num_pairs].ravel(), minlength=placement.num_cameras)
     if placement.piece:
         reasons = dict.fromkeys(range(graph.num_nodes), _ELSEWHERE) | reasons
-    rows = [
-        CameraRow(
-            name=graph.name_of(camera), piece=homes[camera], degree=degree, reason=reasons.get(camera, "")
-        )
-        for camera, degree in enumerate(degrees.tolist())
-    ]
-    for camera, row in zip(
-        placement.cameras.tolist(), own_camera_rows(placement, centers, scale, axes), strict=True
-    ):
-        rows[camera] = replace(row, degree=rows[camera].degree)
+    told = {
+        "name": [graph.name_of(camera) for camera in cameras],
+        "piece": [homes[camera] for camera in cameras],
+        "degree": _degrees(graph.edges[: placement.num_pairs], placement.num_cameras),
+        "reason": [reasons.get(camera, "") for camera in cameras],
+    }
+    rows = Table(CameraRow, graph.dimension, told)
+    for name, values in own_camera_rows(placement, centers, scale, axes).columns.items():
+        if name != "degree":
+            rows.columns[name][placement.cameras] = values
     return rows
 
 
 def own_camera_rows(
     placement: Judged, centers: FloatArray, scale: float, axes: FloatArray | None = None
-) -> list[CameraRow]:
+) -> Table[CameraRow]:
     """Return the rows of the cameras of the piece that is solved; arguments as of `camera_rows`."""
-    graph, assessment = placement.graph, placement.assessment
+    graph, assessment, cameras = placement.graph, placement.assessment, placement.cameras
     inside = graph.edges[placement.edges[placement.pairs]]
-    degrees = np.bincount(inside.ravel(), minlength=graph.num_nodes)
     covariances = placement.covariances if axes is None else _turned(placement.covariances, axes)
-    sigmas, correlations = scale * standard_deviations(covariances), correlations_of(covariances)
-    rows = []
-    for k, camera in enumerate(placement.cameras.tolist()):
-        kept = bool(np.isfinite(centers[k]).all())
-        trust, reason = float(assessment.trust[k]), assessment.reasons[k]
-        rows.append(
-            CameraRow(
-                name=graph.name_of(camera),
-                placed=kept,
-                reason=reason if kept else f"not trusted ({trust:.2f}): {reason}",
-                piece=placement.piece,
-                center=tuple(centers[k].tolist()) if kept else (),
-                degree=int(degrees[camera]),
-                trust=trust,
-                sigma=tuple(sigmas[k].tolist()),
-                correlation=tuple(correlations[k].tolist()),
-            )
-        )
-    return rows
+    trust, kept = assessment.trust[: len(cameras)], np.asarray(np.isfinite(centers).all(axis=1))
+    of_each = zip(kept.tolist(), trust.tolist(), assessment.reasons, strict=False)
+    told = {
+        "name": [graph.name_of(camera) for camera in cameras.tolist()],
+        "placed": kept,
+        "reason": [why if ok else f"not trusted ({value:.2f}): {why}" for ok, value, why in of_each],
+        "piece": [placement.piece] * len(cameras),
+        "center": np.where(kept[:, None], centers, np.nan),
+        "degree": _degrees(inside, graph.num_nodes)[cameras],
+        "trust": trust,
+        "sigma": scale * standard_deviations(covariances),
+        "correlation": correlations_of(covariances),
+    }
+    return Table(CameraRow, graph.dimension, told)
+
+
+def _degrees(pairs: IntArray, count: int) -> IntArray:
+    return np.bincount(pairs.ravel(), minlength=count)[:count]
 
 
 def _turned(covariances: FloatArray, axes: FloatArray) -> FloatArray:
@@ -117,16 +110,17 @@ def _turned(covariances: FloatArray, axes: FloatArray) -> FloatArray:
     return turned
 
 
-def covariance_of(row: CameraRow) -> FloatArray:
-    """Return the covariance (3, 3) of a center, NaN where nothing holds it; of the first three axes."""
-    d = len(row.sigma)
-    correlations = np.eye(d)
+def covariances_of(rows: Table[CameraRow]) -> FloatArray:
+    """Return the covariances (n, 3, 3) of centers, of the first three axes; NaN where nothing holds one."""
+    sigmas, d = rows.columns["sigma"], rows.dimension
+    found = np.zeros((len(rows), max(d, 3), max(d, 3)))
+    correlations = np.tile(np.eye(d), (len(rows), 1, 1))
     i, j = np.triu_indices(d, k=1)
-    correlations[i, j] = correlations[j, i] = row.correlation
-    sigmas = np.array(row.sigma)
-    found = np.zeros((max(d, 3), max(d, 3)))
-    found[:d, :d] = correlations * np.outer(sigmas, sigmas) if np.isfinite(sigmas).all() else np.nan
-    return found[:3, :3]
+    correlations[:, i, j] = correlations[:, j, i] = rows.columns["correlation"]
+    known = np.isfinite(sigmas).all(axis=1)
+    found[:, :d, :d] = np.nan
+    found[known, :d, :d] = (correlations * (sigmas[:, :, None] * sigmas[:, None, :]))[known]
+    return found[:, :3, :3]
 
 
 def covariances_text(covariances: Mapping[str, FloatArray]) -> str:
@@ -164,48 +158,38 @@ def pair_rows(
     placement: Judged,
     support: IntArray,
     further: Sequence[Judged] = (),
-    scores: Sequence[MethodScores] = (),
-) -> list[PairRow]:
-    """Return one row per pair of cameras (m,), with its number of inlier matches, and `scores`.
+    more: Mapping[str, FloatArray] | None = None,
+) -> Table[PairRow]:
+    """Return one row per pair of cameras (m,), with its number of inlier matches, and `more` columns.
 
     Pairs of the `further` pieces that are solved are judged by these.
     """
-    graph, groups = placement.graph, placement.groups
-    judged: dict[int, tuple[Any, ...]] = {}
+    graph, groups, count = placement.graph, placement.groups, placement.num_pairs
+    edges = graph.edges[:count]
+    reasons = np.full(count, _OUTSIDE, dtype=object)
+    if groups is not None:
+        reasons[groups.group_of[edges[:, 0]] == groups.group_of[edges[:, 1]]] = _INNER
+    verdicts = np.full(count, Verdict.UNDETERMINED.value, dtype=object)
+    figures = np.full((4, count), np.nan)
     for piece in (placement, *further):
-        told, dual_norms = piece.assessment, np.linalg.norm(piece.certified.dual, axis=1)
-        figures = (told.residuals_deg, dual_norms / graph.weights[piece.edges], told.leverages)
-        columns = (column.tolist() for column in (*figures, piece.refined.posterior))
-        verdicts = map(told.verdict, range(len(piece.edges)))
-        judged |= zip(piece.edges.tolist(), zip(verdicts, *columns, strict=True), strict=True)
-    rows = []
-    known = (graph.edges, graph.directions, support, graph.weights)
-    given = zip(*(column[: placement.num_pairs].tolist() for column in known), strict=True)
-    for edge, ((i, j), direction, number, weight) in enumerate(given):
-        verdict, residual_deg, dual_norm, leverage, posterior = judged.get(edge, _NOT_JUDGED)
-        reason = _UNCHECKED if verdict is Verdict.UNDETERMINED else ""
-        if edge not in judged:
-            inner = groups is not None and bool(groups.group_of[i] == groups.group_of[j])
-            reason = _INNER if inner else _OUTSIDE
-        rows.append(
-            PairRow(
-                name1=graph.name_of(i),
-                name2=graph.name_of(j),
-                direction=tuple(direction),
-                support=number,
-                residual_deg=residual_deg,
-                verdict=verdict.value,
-                reason=reason,
-                scores=replace(
-                    scores[edge] if scores else MethodScores(),
-                    weight=weight,
-                    dual_norm=dual_norm,
-                    leverage=leverage,
-                    posterior=posterior,
-                ),
-            )
-        )
-    return rows
+        own = piece.edges < count
+        judged, rows = piece.assessment, piece.edges[own]
+        verdicts[rows] = [judged.verdict(k).value for k in np.flatnonzero(own).tolist()]
+        reasons[rows] = np.where(verdicts[rows] == Verdict.UNDETERMINED.value, _UNCHECKED, "")
+        dual_norms = np.linalg.norm(piece.certified.dual, axis=1) / graph.weights[piece.edges]
+        values = judged.residuals_deg, dual_norms, judged.leverages, piece.refined.posterior
+        figures[:, rows] = np.stack(values)[:, own]
+    columns = {
+        "name1": [graph.name_of(i) for i in edges[:, 0].tolist()],
+        "name2": [graph.name_of(j) for j in edges[:, 1].tolist()],
+        "direction": graph.directions[:count],
+        "support": support,
+        "weight": graph.weights[:count],
+        "verdict": verdicts,
+        "reason": reasons,
+    }
+    columns |= zip(("residual_deg", "dual_norm", "leverage", "posterior"), figures, strict=True)
+    return Table(PairRow, graph.dimension, columns | dict(more or {}))
 
 
 def without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int, str]:

@@ -7,31 +7,11 @@ import numpy as np
 
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
+from sfm_shapefit.rotations.sequences import Loop
 from sfm_shapefit.scene.images import Images
 
 if TYPE_CHECKING:
     from sfm_shapefit.placement.options import KnownDistance
-
-
-class Loop(Record):
-    """Pairs between two stretches of a video that are far apart in time, by the names of their frames."""
-
-    first: Annotated[tuple[str, ...], "First and last frame of the earlier stretch."]
-    second: Annotated[tuple[str, ...], "First and last frame of the later stretch."]
-    num_pairs: Annotated[int, "Pairs between the two."]
-    num_matches: Annotated[int, "Their inlier matches."]
-    num_refused: Annotated[int, "Pairs left out, as they do not agree with the chain of pairs near in time."]
-    angle_deg: Annotated[float, "Median angle between their relative rotations and the chain's."]
-    tolerance_deg: Annotated[float, "Largest angle that counts as agreeing."]
-
-    @property
-    def cells(self) -> list[str]:
-        """Its two stretches, pairs, matches, angle and fate, as the report has them in a row."""
-        refused, total = self.num_refused, self.num_pairs
-        fate = "taken" if refused == 0 else "refused" if refused == total else f"taken but for {refused}"
-        angle = f"{self.angle_deg:.2g} (up to {self.tolerance_deg:.2g} agree)"
-        stretches = [_stretch(self.first), _stretch(self.second)]
-        return [*stretches, str(total), str(self.num_matches), angle, fate]
 
 
 class DistanceFacts(Record):
@@ -73,7 +53,7 @@ def describe_loops(loops: Sequence[Loop]) -> str:
     are, them = ("is", "it") if lost == 1 else ("are", "them")
     return (
         f"{said}, of which {lost} {are} not used, as the images between contradict {them} "
-        f"(sequence=none uses all), above all from {_stretch(worst.first)} to {_stretch(worst.second)}"
+        f"(sequence=none uses all), above all from {worst.stretches[0]} to {worst.stretches[1]}"
     )
 
 
@@ -101,9 +81,3 @@ def describe_rival_pairs(count: int) -> str:
         f"the images can be arranged in another way that {counted(count, 'other pair')} speak for, with as "
         "much evidence: the scene repeats itself; look whether parts of it are folded together"
     )
-
-
-def _stretch(frames: Sequence[str]) -> str:
-    """Name a stretch of a video by its first and last frame."""
-    first, last = frames
-    return first if first == last else f"{first} \N{EN DASH} {last}"

@@ -9,21 +9,22 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, TextIO, cast
+from typing import Any, Literal, TextIO, TypeVar, cast, get_args, overload
 
 import numpy as np
 import numpy.typing as npt
 
+from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.atomic_folder import MARKER
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.judgement.limits import KNOWN_DEG
 from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.judgement.verdicts import Verdict
-from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.given import EarthDatum
 
 TableName = Literal["cameras", "pairs"]
 Column = npt.NDArray[Any]
@@ -108,39 +109,98 @@ class PairRow:
     scores: MethodScores = field(default=MethodScores(), repr=False)
     """Columns under their own names."""
 
-    @property
-    def contradicts(self) -> bool:
-        """Whether it says that its cameras stand elsewhere; by less than a degree it does not."""
-        return self.verdict == Verdict.OUTLIER.value and not self.residual_deg < KNOWN_DEG
 
-
-_ROW_TYPES: dict[TableName, type[CameraRow] | type[PairRow]] = {"cameras": CameraRow, "pairs": PairRow}
+R = TypeVar("R", bound=CameraRow | PairRow)
 _PREFIXES = {"center": "", "sigma": "sigma_", "direction": "v", "correlation": "rho_"}
 """Beginning of the columns of a vector, one per axis, or per two axes."""
 
 
-def write_rows(
-    rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int, path: Path
-) -> None:
-    """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
+_KINDS: dict[Any, npt.DTypeLike] = {str: object, bool: np.bool_, int: np.int64, int | None: object}
+"""Types of columns by those of the fields; floats and vectors are float64."""
+
+
+def _fields_of(kind: type) -> Iterator[Field[Any]]:
+    """Yield the fields of a row that are columns: its scores are columns under their own names."""
+    for item in fields(kind):
+        yield from fields(MethodScores) if item.name == "scores" else (item,)
+
+
+class Table(Sequence[R]):
+    """The rows of a table, kept as columns; a row is made when it is asked for."""
+
+    def __init__(self, kind: type[R], dimension: int, columns: Mapping[str, Any]) -> None:
+        """Take columns by the fields of a row, n values each, or (n, d) of vectors with NaN where unknown.
+
+        The first column is given; others that are not have the default of their field.
+        """
+        self.kind, self.dimension = kind, dimension
+        self.columns: dict[str, Column] = {}
+        for item in _fields_of(kind):
+            width = len(columns_of_field(item.name, dimension)) if item.name in _PREFIXES else 0
+            default = item.default if not width else (math.nan,) * width
+            values = columns[item.name] if item.name in columns else [default] * len(self)
+            shape = (-1, width) if width else (-1,)
+            self.columns[item.name] = np.asarray(values, _KINDS.get(item.type, np.float64)).reshape(shape)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} rows of {self.kind.__name__}>"
+
+    @overload
+    def __getitem__(self, at: int) -> R: ...
+    @overload
+    def __getitem__(self, at: slice) -> list[R]: ...
+    def __getitem__(self, at: int | slice) -> R | list[R]:
+        if isinstance(at, slice):
+            return [self[k] for k in range(len(self))[at]]
+        cells = {name: _cell(values[at]) for name, values in self.columns.items()}
+        if self.kind is PairRow:
+            scores = {item.name: cells.pop(item.name) for item in fields(MethodScores)}
+            cells["scores"] = MethodScores(**scores)
+        return self.kind(**cells)
+
+    def taken(self, rows: Sequence[int]) -> "Table[R]":
+        """Return some of the rows."""
+        picked = list(rows)
+        return self.changed({name: values[picked] for name, values in self.columns.items()})
+
+    def changed(self, columns: Mapping[str, Any]) -> "Table[R]":
+        """Return the rows with other columns in place of some."""
+        return Table(self.kind, self.dimension, self.columns | dict(columns))
+
+    def followed_by(self, more: "Table[R]") -> "Table[R]":
+        """Return these rows, and then others."""
+        own = self.columns.items()
+        return self.changed({name: np.concatenate([values, more.columns[name]]) for name, values in own})
+
+    def flat(self) -> dict[str, Column]:
+        """Return the columns of the CSV by their names there, (n,) each."""
+        found: dict[str, Column] = {}
+        for name, values in self.columns.items():
+            names = columns_of_field(name, self.dimension)
+            found |= {name: values} if values.ndim == 1 else dict(zip(names, values.T, strict=True))
+        return found
+
+
+def _cell(value: Any) -> Any:
+    """Return a value of a column as Python has it; a vector of which nothing is known is empty."""
+    if isinstance(value, np.ndarray):
+        return () if np.isnan(value).all() else tuple(value.tolist())
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def write_rows(rows: Table[R], path: Path) -> None:
+    """Write rows as CSV; a vector of d numbers becomes d columns, one per axis."""
     with open_table(path) as stream:
-        write_csv(_values_of(rows, row_type, dimension), stream)
+        write_csv({name: values.tolist() for name, values in rows.flat().items()}, stream)
 
 
-def _values_of(rows: Sequence[Any], row_type: type, dimension: int) -> dict[str, list[Any]]:
-    """Return the values of each column; NaN along the axes of a vector that is not known."""
-    found: dict[str, list[Any]] = {}
-    for item in fields(row_type):
-        if item.name == "scores":
-            found |= _values_of([row.scores for row in rows], MethodScores, dimension)
-            continue
-        values, names = [getattr(row, item.name) for row in rows], columns_of_field(item.name, dimension)
-        if names == [item.name]:
-            found[item.name] = values
-        else:
-            whole = [value or (math.nan,) * len(names) for value in values]
-            found |= {name: [value[k] for value in whole] for k, name in enumerate(names)}
-    return found
+def contradicting(pairs: Table[PairRow]) -> BoolArray:
+    """Return which pairs (m,) say that their cameras stand elsewhere; by less than a degree they do not."""
+    known_deg = pairs.columns["residual_deg"] < KNOWN_DEG
+    return np.asarray((pairs.columns["verdict"] == Verdict.OUTLIER.value) & ~known_deg)
 
 
 def read_trust(path: Path) -> dict[str, float]:
@@ -156,17 +216,16 @@ def read_trust(path: Path) -> dict[str, float]:
         raise InputError(f"{path} is damaged or of another version ({error}); run locate again") from error
 
 
-def model_datum(model: Any) -> Datum | None:
+def model_datum(model: Any) -> EarthDatum | None:
     """Return the datum of a result, or that in locate.json beside a model; None without."""
     if not isinstance(model, Path | str):
-        known = getattr(getattr(model, "facts", None), "datum", None)
-        return known and Datum(known.latitude_deg, known.longitude_deg, known.altitude_m)
+        return getattr(getattr(model, "facts", None), "datum", None)
     file = Path(model) / MARKER
     if not file.is_file():
         return None
     try:
         found = json.loads(text_of(file)).get("datum")
-        return None if found is None else Datum(**found)
+        return None if found is None else EarthDatum(**found)
     except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{file} cannot be read; run locate again, or remove it") from error
 
@@ -234,20 +293,18 @@ class Tabled:
 
     __slots__ = ()
 
-    @property
-    def dimension(self) -> int:
-        """Number of coordinates of a location."""
-        return 3
-
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them.
 
         Raises:
             ValueError: if there is no table of this name.
         """
-        if name not in _ROW_TYPES:
+        if name not in get_args(TableName):
             raise ValueError(f"there is no table {name!r}; there are 'cameras' and 'pairs'")
-        return columns_of(getattr(self, name), _ROW_TYPES[name], self.dimension)
+        columns = getattr(self, name).flat()
+        if name == "cameras":  # where it is none, NaN
+            columns["piece"] = columns["piece"].astype(np.float64)
+        return dict(columns)
 
 
 class Stated(Tabled):
@@ -269,26 +326,3 @@ class Stated(Tabled):
     def timings_s(self: Any) -> Mapping[str, float]:
         """Seconds of each stage."""
         return cast(Mapping[str, float], self.facts.timings_s)
-
-
-def columns_of(
-    rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type[CameraRow] | type[PairRow], dimension: int
-) -> dict[str, Column]:
-    """Return an array for each column of cameras.csv or pairs.csv, by its name there.
-
-    Returns:
-        n values each: numbers are float64, or int64 and bool where none can be missing, NaN where there is
-        none; texts are objects.
-    """
-    kinds = {item.name: item.type for item in (*fields(row_type), *fields(MethodScores))}
-    values = _values_of(rows, row_type, dimension)
-    return {name: _column(column, kinds.get(name)) for name, column in values.items()}
-
-
-def _column(values: list[Any], kind: Any) -> Column:
-    """Return values of a field's type as an array; those along an axis have no field of their own."""
-    if kind is str:
-        return np.array(values, dtype=object)
-    if kind in (bool, int):
-        return np.array(values, dtype=np.bool_ if kind is bool else np.int64)
-    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)

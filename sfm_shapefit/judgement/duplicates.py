@@ -15,7 +15,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.jit import inner_kernel, kernel
-from sfm_shapefit.judgement.evidence import Oddity
+from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import FEW, FEWEST_POINTS, HALF, RARE
 from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.pairs.kernels import median, select_rank
@@ -32,7 +32,7 @@ def find_split_duplicates(
     directions: PairDirections,
     view: View,
     threads: int = 1,
-) -> Iterator[Oddity]:
+) -> Iterator[OddImages]:
     """Yield the images that have a near duplicate which stands half the distance to their points away.
 
     The `directions` are of pairs of the view, some of which have none; `threads` share these.
@@ -48,7 +48,7 @@ def find_split_duplicates(
     np.maximum.at(most, pairs[split], apart[split, None])
     if len(named := np.flatnonzero(most)):
         sentence = "a near duplicate that stands {} times the distance to its points away"
-        yield Oddity(Kind.PLACE, False, named, most[named], sentence)
+        yield OddImages.of_values(Kind.PLACE, images.names_of(named), most[named], sentence)
 
 
 def _depths(images: Images, points: Points) -> FloatArray:

@@ -18,7 +18,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import INSIDE, distances_in_spreads
-from sfm_shapefit.judgement.evidence import Oddity
+from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import MANY, MOST_COMPARED, OUTNUMBERED, RARE, SIGMAS
 from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.scene.images import Images
@@ -31,7 +31,7 @@ _LONG_STEP = 0.8  # share of these steps that are no longer; two leaps among ten
 _MOST_IN_A_ROW = 3  # images that leap together; more are a piece of their own
 
 
-def find_flights(images: Images) -> Iterator[Oddity]:
+def find_flights(images: Images) -> Iterator[OddImages]:
     """Yield the posed images that fly off, and those that leap from where their neighbors stand."""
     posed = np.flatnonzero(images.is_posed)
     centers, names = images.centers[posed], [images.names[k] for k in posed.tolist()]
@@ -39,7 +39,7 @@ def find_flights(images: Images) -> Iterator[Oddity]:
     flies = _flying(spreads)
     if flies.any():
         sentence = "a place {} times as far out as is usual"
-        yield Oddity(Kind.PLACE, False, posed[flies], spreads[flies], sentence)
+        yield OddImages.of_values(Kind.PLACE, images.names_of(posed[flies]), spreads[flies], sentence)
     extent = float(np.linalg.norm(np.ptp(centers[~flies], axis=0)))
     leaps = np.zeros(len(posed))
     for rows, numbers in find_sequences(names):
@@ -47,7 +47,8 @@ def find_flights(images: Images) -> Iterator[Oddity]:
         leaps[rows[kept]] = _leaps(centers[rows[kept]], numbers[kept], RARE * extent)
     if (far := leaps > 0.0).any():
         sentence = "a place {} % of the extent away from the images before and after it"
-        yield Oddity(Kind.PLACE, False, posed[far], 100.0 * leaps[far] / extent, sentence)
+        shares = 100.0 * leaps[far] / extent
+        yield OddImages.of_values(Kind.PLACE, images.names_of(posed[far]), shares, sentence)
 
 
 def _flying(spreads: FloatArray) -> BoolArray:

@@ -38,7 +38,7 @@ stand right to 0.5 % of the extent), and 45 to 100 % of the pairs agree. Wrong p
 do not make a model bad.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -67,7 +67,7 @@ FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to
 class Shares(NamedTuple):
     """How many observations contradict, and how many images are in the output; NaN where it is not known."""
 
-    contradicting: float = np.nan
+    contradicting: float = 0.0
     placed: float = np.nan
     placed_here: float = np.nan
     """Share of all images that are in this model; images of other models of `map` count as missing here."""
@@ -75,59 +75,54 @@ class Shares(NamedTuple):
 
 def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     """Yield what evidence says against a model of some images; the others are not posed."""
-    second, count = evidence.second, int(images.is_posed.sum())
-    confirmed = set() if second is None else set(second.confirmed.tolist())
-    wrong, undecided = ([], []) if second is None else (second.wrong.tolist(), second.undecided.tolist())
+    second, count = evidence.opinion, int(images.is_posed.sum())
     apart, clause = _find_apart(evidence)
-    places = [place.camera for place in evidence.places]
+    places = [place.image for place in evidence.places]
     alone = np.bincount(images.lens_of[images.is_posed], minlength=len(images.lenses)) == 1
-    lenses = [wrong.lens for wrong in evidence.lenses]
-    through = np.flatnonzero(images.is_posed & np.isin(images.lens_of, lenses) & alone[images.lens_of])
-    named = {*apart, *wrong, *undecided, *places, *through.tolist()}
-
-    def names(cameras: Iterable[int]) -> tuple[str, ...]:
-        return tuple(images.names[camera] for camera in cameras)
+    lenses = [wrong.camera for wrong in evidence.lenses]
+    is_through = images.is_posed & np.isin(images.camera_ids, lenses) & alone[images.lens_of]
+    through = images.names_of(np.flatnonzero(is_through))
+    named = {*apart, *second.wrong, *second.undecided, *places, *through}
 
     if apart:
         clause = clause.format(f"{len(apart)} of {counted(count, 'camera')}")
-        grade = Grade.DO_NOT_USE if len(set(apart) - confirmed) > FEW * count else Grade.LOOK
-        yield of_model(Kind.APART, clause, grade, names(apart))
+        grade = Grade.DO_NOT_USE if len(_without(apart, second.confirmed)) > FEW * count else Grade.LOOK
+        yield of_model(Kind.APART, clause, grade, apart)
     held = evidence.num_held
     if held is not None and (held < HALF * count or held < SMALLEST_PIECE <= count):  # any pair holds two
         clause = f"the pairs that agree hold only {held} of {counted(count, 'camera')}"
         yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
     else:
         yield from _too_few_agree(evidence, images)
-    if len(named - confirmed) > MANY * count and len(named) > len(apart):
+    if len(named - second.confirmed) > MANY * count and len(named) > len(apart):
         clause = f"evidence speaks against {len(named)} of {counted(count, 'camera')}"
         yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
     elsewhere = "it stands elsewhere in the model that map made of the same matches"
-    wrong = [camera for camera in wrong if camera not in apart]
-    yield from of_each(Kind.SECOND_OPINION, names(wrong), f"{elsewhere}, which pairs support")
-    yield from of_each(Kind.SECOND_OPINION, names(undecided), f"{elsewhere}, and pairs support neither")
-    yield from of_each(Kind.PLACE, names(places), "pairs agree on another place of it")
+    yield from of_each(
+        Kind.SECOND_OPINION, _without(second.wrong, apart), f"{elsewhere}, which pairs support"
+    )
+    yield from of_each(Kind.SECOND_OPINION, second.undecided, f"{elsewhere}, and pairs support neither")
+    yield from of_each(Kind.PLACE, places, "pairs agree on another place of it")
     if lenses:
         clause = f"images contradict {counted(len(lenses), 'focal length')}"
-        yield of_model(Kind.LENS, clause, images=names(through.tolist()))
-    if evidence.shape is not None and len(evidence.shape.cameras):
+        yield of_model(Kind.LENS, clause, images=through)
+    if evidence.shape is not None and evidence.shape.images:
         clause = f"its own points leave the shape open, {how_far(evidence.shape.largest)}"
-        yield of_model(Kind.UNCERTAIN, clause, images=names(evidence.shape.cameras.tolist()))
-    yield from _weigh_oddities(evidence, images)
-    for one in evidence.contradicted:
-        clause = f"{one.num_against} of its {one.num_pairs} pairs contradict where it stands"
-        yield from of_each(Kind.PAIRS, names([one.camera]), clause)
-    unchecked = [k for group in evidence.untied for k in group.cameras.tolist() if k not in apart]
-    if unchecked:
+        yield of_model(Kind.UNCERTAIN, clause, images=evidence.shape.images)
+    yield from _weigh_oddities(evidence, count)
+    for name in evidence.contradicted:
+        num_pairs, num_against = evidence.contradictions[name]
+        clause = f"{num_against} of its {num_pairs} pairs contradict where it stands"
+        yield from of_each(Kind.PAIRS, [name], clause)
+    if unchecked := _without([name for group in evidence.untied for name in group.images], apart):
         clause = "nothing checks how groups of cameras stand to one another"
         if len(unchecked) == 1:
             clause = "nothing checks how one camera stands to the rest"
-        yield of_model(Kind.UNCHECKED, clause, images=names(unchecked))
-    if second is not None:
-        clause = "at least half as much speaks for another place or rotation of it"
-        yield from of_each(Kind.SECOND_OPINION, names(second.ambiguous.tolist()), clause)
-        if second.has_nothing_in_common:
-            clause = "the model that map makes of the same matches has another shape"
-            yield of_model(Kind.APART, clause)
+        yield of_model(Kind.UNCHECKED, clause, images=unchecked)
+    clause = "at least half as much speaks for another place or rotation of it"
+    yield from of_each(Kind.SECOND_OPINION, second.ambiguous, clause)
+    if second.has_nothing_in_common:
+        yield of_model(Kind.APART, "the model that map makes of the same matches has another shape")
 
 
 def _too_few_agree(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
@@ -144,35 +139,38 @@ def _too_few_agree(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
         yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE if against >= agreeing else Grade.LOOK)
 
 
-def _weigh_oddities(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
-    """Yield which lenses and places hardly can be: of few images of each, of more as one."""
-    few = max(FEW * int(images.is_posed.sum()), 1)
-    are_many = sum(len(one.cameras) for one in evidence.oddities if one.cannot_be) > few
-    for one in sorted(evidence.oddities, key=lambda one: -len(one.cameras)):
-        number = len(one.cameras)
+def _weigh_oddities(evidence: ModelEvidence, num_posed: int) -> Iterator[Reason]:
+    """Yield which lenses and places hardly can be: few images each by itself, more as one."""
+    few = max(FEW * num_posed, 1)
+    are_many = sum(len(one.images) for one in evidence.odd if one.cannot_be) > few
+    for one in sorted(evidence.odd, key=lambda one: -len(one.images)):
+        number = len(one.images)
         is_bad = one.cannot_be and are_many
         if is_bad or number > few:
             clause = f"{counted(number, 'image')} {'has' if number == 1 else 'have'} {one.what}"
-            names = tuple(images.names[camera] for camera in one.cameras.tolist())
             grade = Grade.DO_NOT_USE if is_bad else Grade.LOOK
-            yield of_model(one.kind, clause, images=names, grade=grade)
+            yield of_model(one.kind, clause, images=one.images, grade=grade)
         else:
-            for camera, what in one.of_each:
-                yield from of_each(one.kind, [images.names[camera]], f"it has {what}")
+            for name, what in zip(one.images, one.of_each, strict=True):
+                yield from of_each(one.kind, [name], f"it has {what}")
 
 
-def _find_apart(evidence: ModelEvidence) -> tuple[list[int], str]:
-    """Return the cameras that stand apart, and a clause on how many ({}) do."""
-    loose, second = [group.cameras for group in evidence.untied if group.is_loose], evidence.second
-    groups = [*(seam.cameras for seam in evidence.seams), *loose]
-    if second is not None and len(second.wrong) + len(second.undecided) > 1:  # which tell where seams run
-        groups = [g if second.has_most_alike(g) else np.setdiff1d(g, second.alike) for g in groups]
-    if second is not None and len(second.wrong) > 1:
+def _find_apart(evidence: ModelEvidence) -> tuple[list[str], str]:
+    """Return the images that stand apart, and a clause on how many ({}) do."""
+    loose, second = [group.images for group in evidence.untied if group.is_loose], evidence.opinion
+    groups = [*(seam.images for seam in evidence.seams), *loose]
+    if len(second.wrong) + len(second.undecided) > 1:  # which tell where seams run
+        groups = [g if second.has_most_alike(g) else _without(g, second.alike) for g in groups]
+    if len(second.wrong) > 1:
         groups.insert(0, second.wrong)
     clause = "{} stand apart from the rest"
     if len(loose) == len(groups):
         clause = "nothing says how {} stand to the rest"
-    return list(dict.fromkeys(camera for group in groups for camera in group.tolist())), clause
+    return list(dict.fromkeys(name for group in groups for name in group)), clause
+
+
+def _without(names: Sequence[str], others: Collection[str]) -> tuple[str, ...]:
+    return tuple(name for name in names if name not in others)
 
 
 def too_few_to_judge(num_cameras: int) -> Iterator[Reason]:

@@ -41,7 +41,6 @@ _MEDIAN_SQUARE = 1.386  # median of the square of a residual of two axes with un
 _WIDTH = 2.0  # standard deviations of Cauchy's loss; see Holland and Welsch (1977) for one axis
 _LEAST_DETERMINANT = 1e-12  # determinant of A over its trace cubed; below, the others do not hold a point
 _LEAST_PIVOT = 1e-13  # pivot of a unit diagonal; rounding leaves as much where nothing determines an unknown
-_ANGULAR = ("EQUIRECTANGULAR", "FOV")  # lenses beside the fisheyes whose pictures grow with the angle
 _LEAST_NOISE = 1e-4  # pixels squared; exact points have none, but bend to what is wrong elsewhere
 _LEAST_FREE = 5e-6  # free share; exactly flat scenes have less, wrong lenses in true ones from 1e-5 on
 
@@ -102,7 +101,7 @@ def leave_one_out(
     begins = np.searchsorted(points.images[order], np.arange(n + 1))
     given = (
         points.xyz, points.offsets, points.images, points.points_seen(), rays, on_plane, order, begins,
-        images.rotations, images.centers, images.focal_lengths_px, _are_angular(images), believed,
+        images.rotations, images.centers, images.focal_lengths_px, images.are_angular, believed,
     )  # fmt: skip
     counts, figures = np.zeros(n, dtype=np.int64), np.full((n, 4), np.nan)
     arrays = *(frozen(np.ascontiguousarray(array)) for array in given), counts, figures
@@ -118,7 +117,7 @@ def _look(points: Points, images: Images, pictures: Pictures) -> tuple[Points, F
     Rays are of length 1 and in camera axes; a place (o, 2) is that in a picture of focal length 1.
     """
     rays, places = np.zeros((len(points.images), 3)), np.zeros((len(points.images), 2))
-    angular = _are_angular(images)
+    angular = images.are_angular
     for k, rows in enumerate(points.rows_of_images(images.num_images)):
         if not len(rows):
             continue
@@ -133,12 +132,6 @@ def _look(points: Points, images: Images, pictures: Pictures) -> tuple[Points, F
     if has_ray.all():
         return points, rays, places
     return points.taken(has_ray), rays[has_ray], places[has_ray]
-
-
-def _are_angular(images: Images) -> BoolArray:
-    """Return the images (i,) in which the distance from the center grows with the angle, as of fisheyes."""
-    angular = ["FISHEYE" in lens.model or lens.model in _ANGULAR for lens in images.lenses]
-    return np.array(angular, dtype=np.bool_)[images.lens_of]
 
 
 @kernel

@@ -30,7 +30,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
-from sfm_shapefit.judgement.evidence import Oddity
+from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import FEW, FITTING_PX, HALF, SMALLEST_SHAPE, SURE_SIGMAS
 from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.scene.images import Images, Pictures
@@ -121,7 +121,7 @@ def measure_lens(lens: Lens, reach_px: float = np.nan) -> LensShape:
         short, long, stretch = bent - rho, rho - straight, rho[:asked] / straight[:asked]
     off = np.stack([short[asked:], long[asked:]]) * focal.mean()
     return LensShape(
-        focal_widths=lens.focal_px / max(lens.width, lens.height),
+        focal_widths=lens.focal_widths,
         view_deg=float(np.degrees(wider.sum())) if lens.is_plane else np.nan,
         folds=bool((~(along > 0.0) & inside).any()),
         of_sine=float(np.nanmin(rho[:asked] / bent[:asked], initial=1.0)),
@@ -136,7 +136,9 @@ def _middle(lens: Lens) -> FloatArray:
     return principal if ((principal >= 0.0) & (principal <= size)).all() else 0.5 * size
 
 
-def find_odd_lenses(images: Images, points: Points, pictures: Pictures, bogus: BoolArray) -> Iterator[Oddity]:
+def find_odd_lenses(
+    images: Images, points: Points, pictures: Pictures, bogus: BoolArray
+) -> Iterator[OddImages]:
     """Yield the posed images whose lenses cannot be, or hardly, together by what is wrong about them.
 
     Args:
@@ -157,7 +159,8 @@ def find_odd_lenses(images: Images, points: Points, pictures: Pictures, bogus: B
         cameras = posed[np.isin(images.lens_of[posed], lenses)]
         kind = "a lens that cannot be" if cannot_be else "an unusual lens"
         sentence = f"{kind}: focal length {{}} picture widths, with {fault}"
-        yield Oddity(Kind.LENS, cannot_be, cameras, widths[images.lens_of[cameras]], sentence)
+        names, own = images.names_of(cameras), widths[images.lens_of[cameras]]
+        yield OddImages.of_values(Kind.LENS, names, own, sentence, cannot_be=cannot_be)
     for rows, _ in find_sequences([images.names[k] for k in posed.tolist()]):
         cameras = posed[rows]
         own = widths[images.lens_of[cameras]]
@@ -168,7 +171,8 @@ def find_odd_lenses(images: Images, points: Points, pictures: Pictures, bogus: B
                 far, usual = logs.min(axis=0) > FEW, np.median(own)
                 sentence = "a lens unlike others of one device, as names say: focal length {} picture widths"
                 sentence = f"{sentence}, where {usual:.3g} is usual"
-                yield Oddity(Kind.LENS, False, cameras[far], own[far], sentence)
+                if far.any():
+                    yield OddImages.of_values(Kind.LENS, images.names_of(cameras[far]), own[far], sentence)
 
 
 def _return_to_few(logs: FloatArray) -> bool:

@@ -12,38 +12,61 @@ castle-P19 and P30, 40 % of whose pairs are rejected, have no camera with anothe
 more scenes that are sound (`scripts/results/verdict.md` has spoiled ones).
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.base.record import Record
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.judgement.limits import ALIKE_DEG, FEWEST_ALIKE, HALF, NEAR_DEG, SIGMAS
 
 _MOST_RAYS = 30  # rejected rays of a camera that define places, evenly taken; all of them count
 
 
-class OtherPlace(NamedTuple):
+class AmbiguousPlace(Record):
     """A camera that two sets of pairs put at two places."""
 
-    camera: int
-    """Its row."""
-    num_here: int
-    """Pairs that agree with where it is, and not with the other place."""
-    num_there: int
-    """Rejected pairs that agree on the other place."""
-    offset: FloatArray
-    """(3,) the other place minus this one."""
-    pairs_here: IntArray
-    """(num_here, 2) the pairs that agree with this place alone."""
+    image: Annotated[str, "Its name."]
+    num_here: Annotated[int, "Pairs that put it where it is."]
+    num_there: Annotated[int, "Pairs that agree on the other place."]
+    offset: Annotated[tuple[float, ...], "The other place minus this one, in axes and units of the output."]
+    pairs_here: tuple[tuple[str, str], ...] = ()
+    """The pairs that put it here, and not there, by the names of their images."""
+
+    def moved(self, scale: float, axes: FloatArray | None) -> "AmbiguousPlace":
+        """Return the same in other units and, unless None, after a rotation (3, 3) of the axes."""
+        offset = np.array(self.offset)
+        offset = scale * (offset if axes is None else axes @ offset)
+        return replace(self, offset=tuple(offset.tolist()))
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        away = f"{self.num_there} put it {np.linalg.norm(self.offset):.3g} units away"
+        if not self.num_here:
+            return f"no pair puts {self.image} where it is, {away}"
+        here = f"{counted(self.num_here, 'pair')} put{'s' if self.num_here == 1 else ''}"
+        return (
+            f"{here} {self.image} where it is, {away}: the scene repeats itself, or one of the sets is wrong"
+        )
 
 
 def find_other_places(
-    centers: FloatArray, pairs: IntArray, directions: FloatArray, agrees: BoolArray, level_deg: float
-) -> tuple[OtherPlace, ...]:
+    names: Sequence[str],
+    centers: FloatArray,
+    pairs: IntArray,
+    directions: FloatArray,
+    agrees: BoolArray,
+    level_deg: float,
+) -> tuple[AmbiguousPlace, ...]:
     """Return the cameras for which many of their rejected pairs agree on another place.
 
     Args:
+        names: (n,) of the cameras' images.
         centers: (n, 3) where cameras are; NaN for those that are not to be asked, or believed.
         pairs: (k, 2) cameras i, j.
         directions: (k, 3) measured unit directions of C_i - C_j.
@@ -73,8 +96,16 @@ def find_other_places(
         agreeing, shared = len(both), int(both.sum())
         is_enough = there >= max(FEWEST_ALIKE, HALF * (agreeing - shared))
         if is_enough and shared <= HALF * agreeing:
-            here = pairs[own[agrees[own]][~both]]
-            found.append(OtherPlace(camera, len(here), there, place - centers[camera], here))
+            here = tuple((names[i], names[j]) for i, j in pairs[own[agrees[own]][~both]].tolist())
+            found.append(
+                AmbiguousPlace(
+                    image=names[camera],
+                    num_here=len(here),
+                    num_there=there,
+                    offset=tuple((place - centers[camera]).tolist()),
+                    pairs_here=here,
+                )
+            )
     return tuple(found)
 
 

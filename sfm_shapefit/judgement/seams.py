@@ -18,15 +18,18 @@ on a turn; at lego100, five cameras whose contradictions do are wrong. `scripts/
 that were moved: most are named, but those that are merely scaled by a tenth, which few pairs contradict.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
+from sfm_shapefit.base.record import Record
+from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.limits import ALIKE_DEG, FEW, FEWEST_ALIKE, MOST_COMPARED, OUTNUMBERED
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import is_among
 
 _MOST_ROUNDS = 10  # passes of moves; two or three are usual
@@ -45,19 +48,29 @@ class Cut(NamedTuple):
     """Whether pairs or points tie most of the group to what most of the rest is in."""
 
 
-class Seam(NamedTuple):
-    """A group that stands apart from the rest."""
+class CameraGroup(Record):
+    """A group of cameras, and the pairs between it and the rest."""
 
-    cameras: IntArray
-    """Their rows, ascending."""
-    num_agreeing: int
-    """Pairs across that agree."""
-    num_contradicting: int
-    """Pairs across that contradict."""
-    num_turned: int
-    """Contradicting pairs that agree on one turn of the group."""
-    turn_deg: float
-    """Angle of that turn; NaN without any."""
+    images: Annotated[tuple[str, ...], "Names of its members."]
+    num_agreeing: Annotated[int, "Pairs between it and the rest that agree."]
+    num_contradicting: Annotated[int, "Pairs between it and the rest that contradict."]
+
+
+class GroupApart(CameraGroup):
+    """A group of cameras that agree with one another, and stand apart from the rest."""
+
+    num_turned: Annotated[int, "Contradicting pairs that agree on one turn of the group."]
+    turn_deg: Annotated[float | None, "Angle of that turn; null without any."]
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        turn = f"; {self.num_turned} agree on a turn by {self.turn_deg:.0f} deg" if self.num_turned else ""
+        return (
+            f"{len(self.images)} cameras stand apart from the rest ({first_of(self.images)}): "
+            f"{counted(self.num_agreeing, 'pair')} between them and the rest agree, {self.num_contradicting} "
+            f"contradict{turn}; either side may be the wrong one"
+        )
 
 
 def find_cuts(agreeing: IntArray, contradicting: IntArray, group: IntArray) -> tuple[Cut, ...]:
@@ -88,10 +101,10 @@ def find_cuts(agreeing: IntArray, contradicting: IntArray, group: IntArray) -> t
     return tuple(cuts)
 
 
-def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: FloatArray) -> tuple[Seam, ...]:
-    """Return the cuts that are seams, by what pairs across them say relative to rotations (n, 3, 3).
+def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, images: Images) -> tuple[GroupApart, ...]:
+    """Return the cuts that are seams, by what pairs across them say relative to the images' rotations.
 
-    These are cam_from_world; a pair across may have no relative rotation.
+    A pair across may have no relative rotation.
     """
     sound = relative.subset(relative.are_sound())
     seams = []
@@ -99,12 +112,19 @@ def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: Fl
         rows = np.flatnonzero(is_among(sound.pairs, cut.contradicting))
         taken = min(len(rows), MOST_COMPARED)
         rows = rows[np.arange(taken) * len(rows) // max(taken, 1)]
-        turns = _turns(sound.subset(rows), rotations, cut.cameras)
+        turns = _turns(sound.subset(rows), images.rotations, cut.cameras)
         num_turned, turn_deg = _most_alike(turns)
         is_turned = num_turned >= FEWEST_ALIKE and num_turned > FEW * len(rows)
         if (is_turned and turn_deg > ALIKE_DEG) or not cut.is_tied:
-            num = len(cut.contradicting)
-            seams.append(Seam(cut.cameras, cut.num_agreeing, num, num_turned, turn_deg))
+            seams.append(
+                GroupApart(
+                    images=images.names_of(cut.cameras),
+                    num_agreeing=cut.num_agreeing,
+                    num_contradicting=len(cut.contradicting),
+                    num_turned=num_turned,
+                    turn_deg=turn_deg,
+                )
+            )
     return tuple(seams)
 
 

@@ -17,20 +17,96 @@ at most; models that a wrong lens bends by 0.02 to 0.16, where no camera stands 
 0.004 on).
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, median_spread, rotation_angles_deg
-from sfm_shapefit.judgement.evidence import PairFits, SecondOpinion
-from sfm_shapefit.judgement.limits import FEWEST_ALIKE, NEAR_DEG, OUTNUMBERED, SMALLEST_SHAPE, SURE_SIGMAS
+from sfm_shapefit.base.record import Record
+from sfm_shapefit.base.wording import counted, rounded, stand
+from sfm_shapefit.judgement.limits import (
+    FEW,
+    FEWEST_ALIKE,
+    HALF,
+    NEAR_DEG,
+    OUTNUMBERED,
+    SMALLEST_SHAPE,
+    SURE_SIGMAS,
+)
+from sfm_shapefit.judgement.pair_fits import PairFits
+from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
 
 _FAR = np.radians(NEAR_DEG)  # spreads; what is nearer needs no judge, and six times as far a camera is lost
 _ROUNDING = 1e-7  # spreads and radians; usual differences of the same model are smaller
 _NO_DIRECTION_DEG = 90.0  # degrees; the matches of such a pair contradict the rotations, as badly as can be
+_LEAST_TOLD = 1e-5  # share of the spread; a smaller difference is not told as a number
+
+
+class SecondOpinion(Record):
+    """How the model compares with another one of the same matches, which took nothing of it."""
+
+    num_common: Annotated[int, "Cameras of both."]
+    usual: Annotated[float, "Median distance between both, over the median one of cameras from their middle."]
+    wrong: Annotated[tuple[str, ...], "Images that stand elsewhere there, which pairs support."] = ()
+    undecided: Annotated[
+        tuple[str, ...], "Images that stand elsewhere there, where pairs support neither."
+    ] = ()
+    num_for: Annotated[int, "Pairs that support this model against the other, of wrong images."]
+    num_against: Annotated[int, "Pairs of these that support the other."]
+    ambiguous: Annotated[
+        tuple[str, ...], "Images that stand there too, though matches suit another place or rotation."
+    ] = ()
+    has_nothing_in_common: Annotated[
+        bool, "Whether the two have different shapes, and nothing says whose is right."
+    ] = False
+    grade: Annotated[Grade, "What the other model is worth by itself."] = Grade.LOOK
+    folder: Annotated[str, "Where it stands among the models that map makes of the database."] = "0"
+    confirmed: frozenset[str] = frozenset()
+    """Images that are no farther apart than is usual between the two, if that is near, and not ambiguous."""
+
+    def __post_init__(self) -> None:
+        is_silent = not (self.wrong or self.undecided or self.ambiguous)
+        object.__setattr__(self, "has_nothing_in_common", self.usual > FEW and is_silent)
+
+    @property
+    def alike(self) -> frozenset[str]:
+        """Images that stand where they do in the other model."""
+        return self.confirmed.union(self.ambiguous)
+
+    def has_most_alike(self, images: Sequence[str]) -> bool:
+        """Return whether half or more of some images stand where they do in the other model."""
+        return len(self.alike.intersection(images)) >= HALF * len(images)
+
+    @property
+    def is_alike(self) -> bool:
+        """Whether all its cameras stand where the model has them."""
+        return not (self.wrong or self.undecided or self.has_nothing_in_common)
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        by = "in the model that map made of the same matches"
+        parts = []
+        if self.wrong:
+            parts.append(
+                f"{stand(self.wrong)} elsewhere {by}: "
+                f"{counted(self.num_against, 'pair')} support that, {self.num_for} this model"
+            )
+        if self.undecided:
+            parts.append(f"{stand(self.undecided)} elsewhere {by}, and pairs support neither")
+        if self.ambiguous:
+            where = f"{stand(self.ambiguous)} in the same place {by}"
+            parts.append(f"{where}, but at least half as much speaks for another place or rotation")
+        percent = rounded(100.0 * self.usual, digits=2) if self.usual > _LEAST_TOLD else "less than 0.001"
+        usual = f"positions differ by {percent} % of their spread, median"
+        if self.has_nothing_in_common:
+            return f"{self.num_common} cameras have nothing in common with where they stand {by} ({usual})"
+        told = "; ".join(parts) or f"{self.num_common} cameras stand in the same place {by}"
+        return f"{told} ({usual})"
 
 
 def compare_models(
@@ -69,12 +145,12 @@ def compare_models(
     return SecondOpinion(
         num_common=len(mine),
         usual=usual,
-        wrong=mine[wrong],
-        undecided=mine[undecided],
-        confirmed=mine[alike & ~doubted[theirs] & (usual <= _FAR)],
+        wrong=images.names_of(mine[wrong]),
+        undecided=images.names_of(mine[undecided]),
+        confirmed=frozenset(images.names_of(mine[alike & ~doubted[theirs] & (usual <= _FAR)])),
         num_for=num_for,
         num_against=num_against,
-        ambiguous=mine[alike & doubted[theirs]],
+        ambiguous=images.names_of(mine[alike & doubted[theirs]]),
     )
 
 

@@ -1,13 +1,13 @@
 """What a model's points say of its images: which see too few, and what share of the matches agrees."""
 
-import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.judgement.limits import CHECKED_BY, FEWEST_POINTS, OUTNUMBERED, RARE, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
@@ -36,13 +36,23 @@ def images_of_few_points(points: Points, images: Images, least: IntArray, fixed:
         gone[leaving] = seen[leaving]
 
 
-class ObservationShares(NamedTuple):
-    """Shares of the keypoints that are matched in two or more other registered images; NaN without any."""
+class EvidenceShares(Record):
+    """What share of the evidence agrees with the cameras and points of the output."""
 
-    agreeing: float
-    """The share that sees a 3D point."""
-    contradicting: float
-    """The share that sees none, and most of whose matches miss the epipolar lines of the cameras."""
+    pairs: Annotated[
+        float | None,
+        "Share of the pairs of its cameras that say anything of a direction; null where none does.",
+    ] = None
+    observations: Annotated[
+        float | None,
+        "Share that sees a 3D point, of the keypoints matched in two or more of its other images; null "
+        "without a database.",
+    ] = None
+    contradicting: Annotated[
+        float | None,
+        "Share that sees none and most of whose matches miss the epipolar lines of the cameras, of the "
+        "same keypoints.",
+    ] = None
 
 
 class Support(NamedTuple):
@@ -53,7 +63,7 @@ class Support(NamedTuple):
     images that were not left out for that."""
     unsupported: BoolArray
     """(i,) images whose matches hardly make points; they are left out unless the option min_trust is 0."""
-    observations: ObservationShares
+    observations: EvidenceShares
     """Shares of keypoints matched in two other images that see a point, and that contradict the cameras."""
 
 
@@ -68,13 +78,13 @@ class ObservationCounts:
     contradicting: IntArray
     """(i,) number that sees none, and most of whose matches miss the epipolar lines of the cameras."""
 
-    def shares(self, chosen: BoolArray) -> ObservationShares:
+    def shares(self, chosen: BoolArray) -> EvidenceShares:
         """Return the shares of some of the images (i,) together."""
         total = int(self.checked[chosen].sum())
         if not total:
-            return ObservationShares(math.nan, math.nan)
-        both = self.agreeing[chosen].sum(), self.contradicting[chosen].sum()
-        return ObservationShares(*(int(part) / total for part in both))
+            return EvidenceShares()
+        agreeing, contradicting = (int(part[chosen].sum()) for part in (self.agreeing, self.contradicting))
+        return EvidenceShares(observations=agreeing / total, contradicting=contradicting / total)
 
 
 class PartnerCounts:

@@ -21,16 +21,19 @@ piece that pairs and shared points make. What such a pair says nothing checks, b
 `scripts/results/verdict.md` has halves of scenes that few pairs tie.
 """
 
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, rows_taken, sum_by
 from sfm_shapefit.base.forests import connected_components
+from sfm_shapefit.base.wording import counted, stand
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.few_ties import are_bridges
 from sfm_shapefit.judgement.limits import FEWEST_ALIKE, FEWEST_POINTS, OUTNUMBERED
+from sfm_shapefit.judgement.seams import CameraGroup
 
 _MOST_RAYS = 200  # rays per node that are asked first; what these leave apart is asked by all
 _LINKS_A_BLOCK = 500_000  # links that are counted at a time: 50 MB
@@ -38,19 +41,25 @@ _UNKNOWNS = 7  # numbers; turn, shift and scale: fewer facts leave some of them 
 _PAIR_SAYS, _POINT_SAYS = 5, 2  # numbers; see the header
 
 
-class Untied(NamedTuple):
-    """A group of cameras that so little ties to the rest that nothing checks it."""
+ImagesOf = Callable[[BoolArray], tuple[str, ...]]  # the names of the images of some nodes (n,)
 
-    cameras: IntArray
-    """Their rows, ascending."""
-    num_agreeing: int
-    """Pairs between it and the rest that agree."""
-    num_contradicting: int
-    """Pairs between it and the rest that contradict."""
-    num_points: int
-    """Points of three images or more between it and the rest that fit."""
-    is_loose: bool
-    """Whether nothing says how it stands to the rest."""
+
+class UntiedGroup(CameraGroup):
+    """A group of cameras that so little ties to the rest that nothing checks how it stands to it."""
+
+    num_points: Annotated[int, "Points of three images or more that both see, and that fit."]
+    is_loose: Annotated[bool, "Whether these do not even say how it stands to the rest."]
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        does = "says" if self.is_loose else "checks"
+        agree = f"{counted(self.num_agreeing, 'pair')} and {counted(self.num_points, 'point')}"
+        against = f"{counted(self.num_contradicting, 'pair')} contradict"
+        return (
+            f"nothing {does} how {stand(self.images)} to the rest: {agree} between them agree, {against}; "
+            "match more images across"
+        )
 
 
 class _Rule(NamedTuple):
@@ -118,7 +127,9 @@ def links_of_pairs(agreeing: IntArray, contradicting: IntArray) -> NodeLinks:
     return NodeLinks(np.arange(len(ends)), ends, np.arange(len(ends)) < len(agreeing))
 
 
-def find_groups(group: IntArray, rays: Rays, pairs: NodeLinks) -> tuple[IntArray, tuple[Untied, ...]]:
+def find_groups(
+    group: IntArray, rays: Rays, pairs: NodeLinks, images_of: ImagesOf
+) -> tuple[IntArray, tuple[UntiedGroup, ...]]:
     """Return the group of each node, (n,), and those that are not tied to the largest.
 
     What is unchecked is one group with the largest all the same. `group` (n,) is as of `rigid_groups`.
@@ -133,14 +144,14 @@ def find_groups(group: IntArray, rays: Rays, pairs: NodeLinks) -> tuple[IntArray
         is_done, group = len(np.unique(united)) == len(np.unique(group)), united
     sizes = np.bincount(group)
     names = np.argsort(-sizes, kind="stable")[: np.sum(sizes > 1)].tolist()
-    untied = tuple(_tell(group == name, points, pairs) for name in names[1:])
-    for one in untied:
-        if not one.is_loose:
-            group[one.cameras] = names[0]
-    return group, untied
+    untied = tuple(_describe(group == name, points, pairs, images_of) for name in names[1:])
+    unchecked = [name for name, one in zip(names[1:], untied, strict=True) if not one.is_loose]
+    return np.where(np.isin(group, unchecked), names[0] if names else 0, group), untied
 
 
-def find_hanging(count: int, rays: Rays, pairs: NodeLinks, known: IntArray) -> tuple[Untied, ...]:
+def find_hanging(
+    count: int, rays: Rays, pairs: NodeLinks, known: IntArray, images_of: ImagesOf
+) -> tuple[UntiedGroup, ...]:
     """Return the groups of nodes, of one or more of all n, that a single pair or node holds.
 
     Nodes (k, 2) are `known` to stand rightly to one another; those that no pair holds are not asked.
@@ -156,7 +167,7 @@ def find_hanging(count: int, rays: Rays, pairs: NodeLinks, known: IntArray) -> t
     outside, points = _outside(count, edges), rays.links()
     among = connected_components(count, edges[outside[edges].all(axis=1)])
     groups = (outside & (among == name) for name in np.unique(among[outside]).tolist())
-    return tuple(_tell(group, points, pairs)._replace(is_loose=False) for group in groups)
+    return tuple(replace(_describe(group, points, pairs, images_of), is_loose=False) for group in groups)
 
 
 def _distinct_edges(edges: IntArray) -> IntArray:
@@ -220,7 +231,7 @@ def _unite(group: IntArray, links: NodeLinks, rule: _Rule) -> IntArray:
     return connected_components(len(group), pairs[rows])[group]
 
 
-def _tell(inside: BoolArray, points: NodeLinks, pairs: NodeLinks) -> Untied:
+def _describe(inside: BoolArray, points: NodeLinks, pairs: NodeLinks, images_of: ImagesOf) -> UntiedGroup:
     """Return a group, the nodes inside, with what crosses between it and the rest."""
     ends, facts = [np.zeros((0, 2), dtype=np.int64)], 0
     numbers: list[int] = []
@@ -234,7 +245,13 @@ def _tell(inside: BoolArray, points: NodeLinks, pairs: NodeLinks) -> Untied:
     every = np.concatenate(ends)
     of_one = any((every == node).any(axis=1).all() for node in np.unique(every).tolist())
     agreeing, contradicting, shared, _ = numbers
-    return Untied(np.flatnonzero(inside), agreeing, contradicting, shared, facts < _UNKNOWNS or of_one)
+    return UntiedGroup(
+        images=images_of(inside),
+        num_agreeing=agreeing,
+        num_contradicting=contradicting,
+        num_points=shared,
+        is_loose=facts < _UNKNOWNS or of_one,
+    )
 
 
 def _tied(group: IntArray, links: NodeLinks, rule: _Rule) -> tuple[IntArray, FloatArray]:

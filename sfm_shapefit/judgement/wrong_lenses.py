@@ -13,35 +13,96 @@ to ask for a focal length that leaves the range of like lenses, by more than 2.5
 ones have the same model and size, and took one image each.
 """
 
-from typing import NamedTuple
+from typing import Annotated, Self
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
+from sfm_shapefit.base.record import Record
+from sfm_shapefit.base.wording import label_lens
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
 from sfm_shapefit.judgement.limits import HALF, OUTNUMBERED, SIGMAS, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE, Lens
 from sfm_shapefit.scene.points import Points
 
 # Change of the focal length, and standard deviations, beyond which that of one image is wrong, and beyond
 # which half of the images of a lens show that it is; see the header.
 _ONE, _HALF = (0.025, 10.0), (0.004, SIGMAS)
+_UNLIKE = 2.0  # scatters of what images ask for; a mean that is nearer names no other focal length
 
 
-class WrongLens(NamedTuple):
-    """A lens whose images contradict its focal length."""
+class ContradictedLens(Record):
+    """A lens whose images, left out one by one, ask for another focal length."""
 
-    lens: int
-    """Its row."""
+    camera: Annotated[int, "Its id in the model."]
+    image: Annotated[str, "The first of its images."]
+    num_images: Annotated[int, "Images that were asked."]
+    focal_px: Annotated[float, "Mean focal length of the model."]
+    asked_focal_px: Annotated[float, "Focal length that its images ask for, the median one."]
+    asked_sigma_px: Annotated[
+        float, "Standard deviation of it: by the noise for one image or two, by the scatter over more."
+    ]
+    remedy: Annotated[str, "What to do about it, or what has been done."]
     factor: float
-    """Focal length that its images ask for, the median one, over the given one."""
+    """The focal length that is asked for over that of the model."""
     sigma: float
-    """Standard deviation of it: by the noise for one image, by the scatter over several."""
-    num_images: int
-    """Images that were asked."""
+    """The standard deviation as a share of the focal length that is asked for."""
     score: float
-    """Change in standard deviations, the median one of its images."""
+    """The change in standard deviations, the median one of its images."""
+
+    @classmethod
+    def of_lens(
+        cls, lens: Lens, image: str, asked: tuple[float, float], num_images: int, score: float
+    ) -> Self:
+        """Return the record of a lens, and the first of its images.
+
+        Args:
+            lens, image: the two.
+            asked: the factor of the focal length that its images ask for, and its standard deviation.
+            num_images: number of images that were asked.
+            score: the change in standard deviations.
+        """
+        factor, sigma = asked
+        asked_px, remedy = factor * lens.focal_px, "intrinsics=focal lets it change, or calibrate that camera"
+        if not lens.is_adjustable:
+            remedy = f"{ADJUSTED_ELSEWHERE}; or calibrate that camera"
+        elif lens.origin is not None and lens.parameters != lens.given:
+            remedy = "it was adjusted already, so calibrate that camera"
+        return cls(
+            camera=lens.id,
+            image=image,
+            num_images=num_images,
+            focal_px=lens.focal_px,
+            asked_focal_px=asked_px,
+            asked_sigma_px=sigma * asked_px,
+            remedy=remedy,
+            factor=factor,
+            sigma=sigma,
+            score=score,
+        )
+
+    @property
+    def label(self) -> str:
+        """Its id, and the images by which a user knows it."""
+        return label_lens(self.camera, self.image, self.num_images)
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        asked = f"{self.asked_focal_px:,.0f} ± {self.asked_sigma_px:,.0f} px"
+        if abs(self.asked_focal_px - self.focal_px) < _UNLIKE * self.asked_sigma_px:
+            return (
+                f"the focal length of {self.label}, {self.focal_px:,.0f} px, is doubtful: its "
+                f"{self.num_images} images ask for unlike ones by the points that the others make ({asked}), "
+                "so that the lens or the places of images are wrong"
+            )
+        who = "its image asks" if self.num_images == 1 else f"its {self.num_images} images ask"
+        return (
+            f"the focal length of {self.label} is wrong: {who} for {asked}, not {self.focal_px:,.0f} "
+            f"px, by the points that the others make; its images stand wrong by that: {self.remedy}"
+        )
 
 
 def is_like_others(images: Images, lens: int, focal_px: float, sigma: float) -> bool:
@@ -76,7 +137,7 @@ def question_lenses(
     threads: int = 1,
     among: BoolArray | None = None,
     asked: BoolArray | None = None,
-) -> tuple[LeftOut, tuple[WrongLens, ...]]:
+) -> tuple[LeftOut, tuple[ContradictedLens, ...]]:
     """Return what images say when they are left out, and the lenses that they contradict, the worst first.
 
     The rays of a wrong lens pull at the points of right ones. So what is named most clearly is taken out of
@@ -90,14 +151,15 @@ def question_lenses(
         found = leave_one_out(points, images, pictures, threads, believed, asked)
         left_out = found.of_little_noise(make)
         wrong = wrong_lenses(left_out, images)
-        fresh = [item for item in wrong if believed[images.lens_of == item.lens].any()]
-        gone = np.isin(images.lens_of, [item.lens for item in fresh if item.score >= HALF * fresh[0].score])
+        fresh = [item for item in wrong if believed[images.camera_ids == item.camera].any()]
+        worst = [item.camera for item in fresh if item.score >= HALF * fresh[0].score]
+        gone = np.isin(images.camera_ids, worst)
         if not fresh or 2 * np.sum(make & (~believed | gone)) >= np.sum(make):
             return left_out, wrong
         believed &= ~gone
 
 
-def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
+def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[ContradictedLens, ...]:
     """Return the lenses that the images contradict when they are left out, the most contradicted first."""
     found = []
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -121,5 +183,6 @@ def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
             sigma = SIGMA_PER_MEDIAN * float(np.median(np.abs(changes - middle)))
         score = float(np.median(scores[rows]))
         if np.median(np.abs(changes)) > least and score > deviations:
-            found.append(WrongLens(lens, float(np.exp(middle)), sigma, len(rows), score))
+            first, asked = images.names[int(np.argmax(own))], (float(np.exp(middle)), sigma)
+            found.append(ContradictedLens.of_lens(images.lenses[lens], first, asked, len(rows), score))
     return tuple(sorted(found, key=lambda item: -item.score))

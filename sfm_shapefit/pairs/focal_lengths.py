@@ -28,12 +28,6 @@ _APART, _LEAST_GAIN = 4, 0.02
 # Share of matches that a lens of the right bend explains at least, and first coefficients to be tried where
 # none is reached: lenses of these models may be guessed planes and be fisheyes.
 _FITS = 0.5
-_BENDS = {
-    "FOV": (0.5, 1.0, 1.5),
-    "SIMPLE_DIVISION": (-0.1, -0.3),
-    "DIVISION": (-0.1, -0.3),
-    "EUCM": (0.4, 0.7),
-}
 _MOST_KINDS = 8  # kinds of lenses, those of most images; each takes a second
 # Pairs of a kind, evenly of all by their matches; pairs of the most matches alone are of neighbors, which say
 # little. Pairs of few matches fit any focal length, and of very many a part does.
@@ -69,7 +63,7 @@ def find_lenses(view: View, wanted: BoolArray, doubted: BoolArray) -> dict[int, 
         of_group = np.isin(np.arange(len(wanted)), rows)
         matches, share = _choose_matches(view, of_group, of_group | ~doubted), -1.0
         start = images.lenses[rows[0]]
-        for lens in (start, *(start.bent(bend) for bend in _BENDS.get(start.model, ()))):
+        for lens in (start, *(start.bent(bend) for bend in start.bends)):
             tried = tuple(
                 lens if is_own else other for other, is_own in zip(images.lenses, of_group, strict=True)
             )

@@ -16,7 +16,7 @@ from sfm_shapefit.files.colmap.listed_poses import read_by_itself, read_source
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.model_folder import model_folders
-from sfm_shapefit.judgement.evidence import fit_pairs
+from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.map import map_database, map_opened
@@ -92,7 +92,7 @@ def _map_anew(
     best = models[number]
     doubted = np.zeros(best.placed.num_images, dtype=np.bool_)
     doubted[best.placement.cameras] = best.placement.assessment.ambiguous
-    doubted[[place.camera for place in best.evidence.places]] = True
+    doubted |= best.placed.are_named([place.image for place in best.evidence.places])
     fits = fit_pairs(best.placed.centers, best.directions)
     return OtherModel(best.placed, fits, doubted, mapped, number)
 

@@ -34,7 +34,7 @@ from sfm_shapefit.rotations.average import average_relative_rotations, check_pai
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.options import AveragingOptions
-from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
+from sfm_shapefit.rotations.sequences import Loop, Videos, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.scene.given import Gravity, Known
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames, View, rows_of_pairs
@@ -124,17 +124,17 @@ class MapContext(NamedTuple):
 
     def judge_loops(
         self, videos: Videos, relative: RelativeRotations
-    ) -> tuple["MapContext", RelativeRotations, tuple[Visit, ...]]:
-        """Return run and pairs without loop pairs that the chains of their videos contradict, and visits."""
+    ) -> tuple["MapContext", RelativeRotations, tuple[Loop, ...]]:
+        """Return run and pairs without loop pairs that the chains of videos contradict, and all loops."""
         if not videos.num_videos:
             return self, relative, ()
         with self.clock("rotation averaging"):
-            loops = judge_loops(videos, relative, self.clock.threads)
+            verdict = judge_loops(videos, self.images.names, relative, self.clock.threads)
         names = self.images.names
-        refused = {(names[i], names[j]) for i, j in relative.pairs[loops.refused].tolist()}
-        kept = np.delete(np.arange(len(relative.pairs)), loops.refused)
+        refused = {(names[i], names[j]) for i, j in relative.pairs[verdict.refused].tolist()}
+        kept = np.delete(np.arange(len(relative.pairs)), verdict.refused)
         without = self.without | {(min(pair), max(pair)) for pair in refused}
-        return self._replace(without=without), relative.subset(kept), loops.visits
+        return self._replace(without=without), relative.subset(kept), verdict.loops
 
     def score_pairs(self, relative: RelativeRotations) -> "MapContext":
         """Return the run with the scores by which pairs of repeated structure are told."""

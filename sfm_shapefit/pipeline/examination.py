@@ -1,5 +1,6 @@
 """Ask for evidence that the fit did not use: of our own models, and of any that is looked at."""
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -14,12 +15,20 @@ from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.lenses import is_bogus
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
-from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape, PairFits, fit_pairs
+from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape
 from sfm_shapefit.judgement.flights import find_flights
 from sfm_shapefit.judgement.lenses import find_odd_lenses
 from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED, RARE, SMALLEST_SHAPE
-from sfm_shapefit.judgement.seams import Seam, find_cuts, find_seams
-from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, find_hanging, links_of_pairs, rigid_groups
+from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
+from sfm_shapefit.judgement.seams import GroupApart, find_cuts, find_seams
+from sfm_shapefit.judgement.ties import (
+    Rays,
+    UntiedGroup,
+    find_groups,
+    find_hanging,
+    links_of_pairs,
+    rigid_groups,
+)
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.witnesses import are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
@@ -52,31 +61,29 @@ def gather_evidence(
     bogus = np.array([is_bogus(lens) for lens in images.lenses], dtype=np.bool_)
     odd = (*find_odd_lenses(images, points, pictures, bogus), *find_flights(images))
     if fits is None:
-        return ModelEvidence(lenses=lenses, oddities=odd)
+        return ModelEvidence(lenses=lenses, odd=odd)
     if source.has_database and _has_keypoints(source.view, structure):
         given = images, points, pictures, fits.directions, source.view
         odd = (*odd, *find_split_duplicates(*given, threads))
     tied, untied = _tie(source, fits, structure)
-    cuts, seams = find_cuts(*fits.sides, tied), tuple[Seam, ...]()
+    cuts, seams = find_cuts(*fits.sides, tied), tuple[GroupApart, ...]()
     if cuts:  # which are seams by the rotations that pairs across have by themselves
         across = np.concatenate([cut.contradicting for cut in cuts])
-        seams = find_seams(cuts, ask_rotations(source, across, threads), source.images.rotations)
-    apart = [camera for seam in seams for camera in seam.cameras.tolist()]
-    contradicted, places = fits.contradicted(images), fits.other_places()
-    asked_of = [one.camera for one in contradicted]
-    asked_of += [] if source.has_database else [one.camera for one in places]
-    doubted = np.isin(np.arange(images.num_images), asked_of)
-    confirmed = ask_pixels(
-        source, structure, doubted
-    )  # own tracks hold no second place of who fits the first
+        seams = find_seams(cuts, ask_rotations(source, across, threads), source.images)
+    apart = frozenset(name for seam in seams for name in seam.images)
+    contradictions, places = fits.contradicted(images), fits.other_places(images.names)
+    asked_of = [*contradictions, *(() if source.has_database else (one.image for one in places))]
+    # Own tracks hold no second place of who fits the first.
+    confirmed = ask_pixels(source, structure, asked_of)
     num_unasked = int(np.sum(source.view.num_keypoints == 0)) if source.inputs.is_made else 0
     return ModelEvidence(
         lenses=lenses,
-        oddities=odd,
-        places=tuple(one for one in places if source.has_database or not confirmed[one.camera]),
+        odd=odd,
+        places=tuple(one for one in places if source.has_database or one.image not in confirmed),
         seams=seams,
-        contradicted=tuple(one for one in contradicted if not confirmed[one.camera]),
-        untied=tuple(one for one in untied if 2 * np.isin(one.cameras, apart).sum() < len(one.cameras)),
+        contradicted=tuple(name for name in contradictions if name not in confirmed),
+        contradictions=contradictions,
+        untied=tuple(one for one in untied if 2 * len(apart.intersection(one.images)) < len(one.images)),
         num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)) + num_unasked,
         sides=(int(fits.agrees.sum()), int(fits.contradicts.sum())),
     )
@@ -96,7 +103,9 @@ def question(state: ModelState, clock: Clock) -> ModelEvidence:
     pictures = ModelPictures(images, source.view.keypoints, source.view.num_keypoints)
     structure = Structure(points, images, pictures, among, None if source.fixed is None else ~source.fixed)
     source = replace(source, tied=_tied_by_priors(state, images))
-    return gather_evidence(source, fits, structure, clock.threads)
+    found, gauge = gather_evidence(source, fits, structure, clock.threads), state.gauge
+    places = (one.moved(gauge.similarity.scale, gauge.axes) for one in found.places)
+    return replace(found, places=tuple(places))
 
 
 def confirm_by_pixels(state: ModelState) -> BoolArray:
@@ -110,7 +119,8 @@ def confirm_by_pixels(state: ModelState) -> BoolArray:
         return np.zeros_like(doubted)
     images = with_left_out(state)
     pictures = ModelPictures(images, source.view.keypoints, source.view.num_keypoints)
-    return ask_pixels(source, Structure(state.points, images, pictures), doubted)
+    names = images.names_of(np.flatnonzero(doubted))
+    return images.are_named(ask_pixels(source, Structure(state.points, images, pictures), names))
 
 
 def with_left_out(state: ModelState) -> Images:
@@ -164,12 +174,12 @@ def ask_shape(
     if not isinstance(tracks, ObservedTracks) or len(rows) < SMALLEST_SHAPE:
         return None
     held = {"lenses_held": lenses_held, "rotations_held": rotations_held}
-    shape = (
+    covariances = (
         None
         if all(held.values())
         else estimate_open_shape(images.part(rows), tracks, **held, threads=threads)
     )
-    return None if shape is None else OpenShape.of(images, rows, shape)
+    return None if covariances is None else OpenShape.of_images(images, rows, covariances)
 
 
 def open_beyond_noise(state: ModelState, shape: OpenShape) -> FloatArray:
@@ -204,17 +214,19 @@ def images_to_ask(images: Images, asked: BoolArray | None) -> BoolArray | None:
     return some
 
 
-def ask_pixels(source: MatchSource, structure: Structure, doubted: BoolArray) -> BoolArray:
-    """Return which doubted images (i,) stand where their pixels see the points that the others make.
+def ask_pixels(source: MatchSource, structure: Structure, doubted: Collection[str]) -> frozenset[str]:
+    """Return the names of doubted images that stand where their pixels see the points that the others make.
 
-    None is where the model has other keypoints than the matches.
+    There are none where the model has other keypoints than the matches.
     """
     points, images, pictures = structure[:3]
     view = source.view
-    if not (doubted.any() and _has_keypoints(view, structure)):
-        return np.zeros_like(doubted)
-    links = list(view.links(chosen=np.asarray(doubted[view.pairs].any(axis=1))))
-    return are_confirmed(points, images, pictures, doubted, (view.num_keypoints, links))
+    if not (doubted and _has_keypoints(view, structure)):
+        return frozenset()
+    rows = images.are_named(doubted)
+    links = list(view.links(chosen=np.asarray(rows[view.pairs].any(axis=1))))
+    sure = are_confirmed(points, images, pictures, rows, (view.num_keypoints, links))
+    return frozenset(images.names_of(np.flatnonzero(sure)))
 
 
 def _has_keypoints(view: View, structure: Structure) -> bool:
@@ -223,7 +235,9 @@ def _has_keypoints(view: View, structure: Structure) -> bool:
     return structure.points.num_points > 0 and counts == view.num_keypoints.tolist()
 
 
-def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[IntArray, tuple[Untied, ...]]:
+def _tie(
+    source: MatchSource, fits: PairFits, structure: Structure
+) -> tuple[IntArray, tuple[UntiedGroup, ...]]:
     """Return what each image (i,) is tied to, by number, and the groups that hardly anything ties to it.
 
     Frames move as one, and what is fixed or joined stays. Where too few points are known for that, what pairs
@@ -231,6 +245,10 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
     """
     points, images, pictures = structure[:3]
     frames = images.frame_of
+
+    def images_of(inside: BoolArray) -> tuple[str, ...]:
+        return images.names_of(np.flatnonzero(inside[frames] & images.is_posed))
+
     fitting = keypoint_errors_px(points, images, pictures) <= FITTING_PX
     rays = Rays(points.points_seen(), frames[points.images], fitting)
     pairs = links_of_pairs(*(frames[side] for side in fits.sides))
@@ -242,19 +260,17 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
     group = rigid_groups(len(images.frames.ids), rays, together)
     lost = lost_points(source.view, structure, fitting, group[frames])
     rays = rays._replace(fits=fitting & ~lost[rays.points])
-    tied, groups = find_groups(group, rays, pairs)
+    tied, groups = find_groups(group, rays, pairs, images_of)
     posed, of = np.unique(frames[images.is_posed]), tied[frames]
     if 2 * np.bincount(tied[posed]).max(initial=0) < len(posed):
         held = fits.held(images)
         if 2 * held.sum() < images.is_posed.sum():
             held = fits.held(images, points.taken(fitting))
         of, groups = np.where(held, 0, 1 + frames), ()
-    named = [node for one in groups for node in one.cameras.tolist()]
+    named = frozenset(name for one in groups for name in one.images)
     holding = links_of_pairs(frames[fits.directions.pairs[fits.may_hold]], frames[fits.sides[1]])
-    hanging = find_hanging(len(group), rays, holding, together)
-    groups = (*groups, *(one for one in hanging if not np.isin(one.cameras, named).any()))
-    rows = (np.flatnonzero(np.isin(frames, one.cameras) & images.is_posed) for one in groups)
-    return of, tuple(one._replace(cameras=cameras) for one, cameras in zip(groups, rows, strict=True))
+    hanging = find_hanging(len(group), rays, holding, together, images_of)
+    return of, (*groups, *(one for one in hanging if named.isdisjoint(one.images)))
 
 
 def lost_points(view: View, structure: Structure, fits: BoolArray, group: IntArray) -> BoolArray:

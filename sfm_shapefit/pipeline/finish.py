@@ -8,19 +8,10 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, hand_back_memory
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, turned_deg
-from sfm_shapefit.facts.intrinsics import intrinsics_warnings
-from sfm_shapefit.facts.result import NO_POINTS, LocateResult
+from sfm_shapefit.facts.located_warnings import located_warnings
+from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
-from sfm_shapefit.facts.warnings import (
-    ambiguity_warnings,
-    match_warnings,
-    prior_warnings,
-    quality_warnings,
-    rotation_suspicions,
-    rotation_warnings,
-    support_warnings,
-    trust_warnings,
-)
+from sfm_shapefit.facts.warnings import rotation_suspicions, rotation_warnings
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.judgement.uncertainty import standard_deviations
@@ -94,22 +85,12 @@ def _compare_with_priors(state: ModelState) -> PriorFit | None:
 
 def _warnings(result: LocateResult, state: ModelState) -> Iterator[str]:
     """Yield what the user should know of a finished piece beyond the tables: what speaks against it first."""
-    images, options, gauge = result.placed, result.options, result.gauge
-    yield from result.told_evidence.statements
-    yield from intrinsics_warnings(result.intrinsics.rows(images))
-    yield from match_warnings(state.directions, may_repeat=state.source.has_database)
-    yield from quality_warnings(result.placement, options.placement)
-    yield from trust_warnings(result.placement, result.kept)
-    yield from ambiguity_warnings(result.placement)
-    if result.model.num_points3D() == 0:
-        yield f"{NO_POINTS}; bundle adjustment has nothing to start from"
-    yield from prior_warnings(result.prior_fit, images.names)
+    images, gauge = result.placed, result.gauge
     posed = np.flatnonzero(images.is_posed)
-    yield from state.gauge_rule.check(gauge, posed, images.centers[posed])
-    if options.gauge.scale == "unit" and gauge.scale != "unit":
-        yield f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}"
-    unsupported = [images.names[k] for k in np.flatnonzero(result.unsupported).tolist()]
-    yield from support_warnings(unsupported, is_kept=options.trust.min_trust == 0.0)
+    of_scale = list(state.gauge_rule.check(gauge, posed, images.centers[posed]))
+    if result.options.gauge.scale == "unit" and gauge.scale != "unit":
+        of_scale.append(f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}")
+    yield from located_warnings(result, of_scale)
     yield from state.warnings
 
 

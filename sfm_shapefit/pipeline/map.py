@@ -23,7 +23,7 @@ from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import MapContext, start_run
 from sfm_shapefit.pipeline.mapping import join_mapped, locate_components, refine_intrinsics
-from sfm_shapefit.rotations.sequences import Videos, Visit
+from sfm_shapefit.rotations.sequences import Loop, Videos
 from sfm_shapefit.scene.lens import FOCAL
 
 _MANY_DOUBTED = 0.25
@@ -75,9 +75,9 @@ def map_opened(
     """Do what `map_database` does, with a database that is open."""
     run = start_run(file, options, clock, priors)
     path = file.path
-    run, relative, videos, visits = measure_run(run)
+    run, relative, videos, loops = measure_run(run)
     reasons = dict.fromkeys(range(int(run.frame_of_image.max()) + 1), _UNMATCHED)
-    models = locate_components(run, relative, visits, reasons)
+    models = locate_components(run, relative, loops, reasons)
     if not models:
         raise UnsolvableError(_explain_failure(file, relative, reasons))
     with clock("join") if options.join == "safe" else nullcontext():
@@ -109,8 +109,8 @@ def map_opened(
     return tell_joins(result)
 
 
-def measure_run(run: MapContext) -> tuple[MapContext, RelativeRotations, Videos, tuple[Visit, ...]]:
-    """Return the relative rotations of all pairs that are believed, videos, and visits.
+def measure_run(run: MapContext) -> tuple[MapContext, RelativeRotations, Videos, tuple[Loop, ...]]:
+    """Return the relative rotations of all pairs that are believed, videos, and their loops.
 
     The run knows scores of the pairs then, and which ones are refused.
     """
@@ -122,8 +122,8 @@ def measure_run(run: MapContext) -> tuple[MapContext, RelativeRotations, Videos,
             run = run._replace(images=known)
             relative = run.measure()
     videos = run.find_videos(relative)
-    run, relative, visits = run.judge_loops(videos, relative)
-    return run.score_pairs(relative), relative, videos, visits
+    run, relative, loops = run.judge_loops(videos, relative)
+    return run.score_pairs(relative), relative, videos, loops
 
 
 def _explain_failure(file: DatabaseFile, relative: RelativeRotations, reasons: dict[int, str]) -> str:

@@ -1,6 +1,6 @@
 """`map` from averaged rotations to models: one of each component, and those that belong together joined."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -14,7 +14,6 @@ from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.facts.scene import Loop
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
@@ -30,7 +29,7 @@ from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.place import ContradictedOffsetsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
-from sfm_shapefit.rotations.sequences import Visit
+from sfm_shapefit.rotations.sequences import Loop
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
@@ -65,7 +64,7 @@ def _place_first(inputs: RunInputs, source: MatchSource, clock: Clock) -> Estima
 
 
 def locate_components(
-    run: MapContext, relative: RelativeRotations, visits: Sequence[Visit], reasons: dict[int, str]
+    run: MapContext, relative: RelativeRotations, loops: Sequence[Loop], reasons: dict[int, str]
 ) -> list[LocateResult]:
     """Return a model of each component that can be placed, most cameras first.
 
@@ -78,10 +77,11 @@ def locate_components(
         except UnsolvableError as error:
             reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
-        names = tuple(run.images.names[k] for k in members.tolist())
-        loops = tuple(_loops_of(visits, run.images.names, set(names)))
-        found = replace(located, loops=loops, averaging=averaging, averaged_names=names)
-        models += _rigid_models(found, run.options.averaging.min_model_size)
+        names = run.images.names_of(members)
+        inside = frozenset(names)
+        of_these = tuple(one for one in loops if one.first[0] in inside)
+        result = replace(located, loops=of_these, averaging=averaging, averaged_names=names)
+        models += _rigid_models(result, run.options.averaging.min_model_size)
         for k in frames.tolist():
             del reasons[k]
     return sorted(models, key=lambda model: -int(model.kept.sum()))
@@ -155,13 +155,6 @@ def _suspicions(averaging: AveragedRotations) -> Iterator[Reason]:
         yield of_model(Kind.REPEATED, clause)
     if averaging.num_rivals:
         yield of_model(Kind.REPEATED, "the images can be arranged in another way")
-
-
-def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) -> Iterator[Loop]:
-    for visit in visits:
-        first, second = ((names[a], names[b]) for a, b in (visit.first, visit.second))
-        if first[0] in among:
-            yield Loop.taken_from(visit, first=first, second=second)
 
 
 def join_mapped(

@@ -21,7 +21,7 @@ from sfm_shapefit.base.geometry import Similarity, angle_between, compose, media
 from sfm_shapefit.facts.joined_cameras import JoinedGroup, joined_camera_rows, joined_verdict
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.map_result import JoinedModel
-from sfm_shapefit.facts.model import EarthDatum, JoinedFacts
+from sfm_shapefit.facts.model import JoinedFacts
 from sfm_shapefit.facts.placed import UNITS, KeyFigures
 from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.scene import told_distances
@@ -216,7 +216,7 @@ def tell_group(
     source = replace(source.at(model.images), tied=tied)
     checked = check_source(model, source, options, clock)
     seen, measures = checked.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
-    cameras = list(joined_camera_rows(checked.cameras, group, located))
+    cameras = joined_camera_rows(checked.cameras, group, located)
     facts = JoinedFacts.taken_from(
         seen,
         inputs=join_inputs.inputs.facts,
@@ -231,7 +231,7 @@ def tell_group(
         scale=gauge.statement,
         scale_sigma=gauge.scale_sigma,
         known_distances=told_distances(join_inputs.distances, model.images),
-        datum=EarthDatum.of(gauge.datum),
+        datum=gauge.datum,
         timings_s=clock.seconds,
         warnings=[*join_inputs.notes, *seen.warnings, *filter(None, [gauge.warning])],
     )

@@ -25,7 +25,7 @@ from sfm_shapefit.files.colmap.picture_matches import PictureMatches, read_descr
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, Shared, choose_pairs
-from sfm_shapefit.judgement.evidence import PairFits
+from sfm_shapefit.judgement.pair_fits import PairFits
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.matches import is_among
 from sfm_shapefit.scene.structure import Structure

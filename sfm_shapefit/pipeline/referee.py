@@ -13,7 +13,6 @@ where its cameras stand. It is not to be used for the evidence of `judgement.gra
 to be looked at.
 """
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -30,16 +29,16 @@ from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
-from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, fit_pairs
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
+from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
 from sfm_shapefit.judgement.reasons import (
     ARE_ITS_PICTURES,
     IS_ITS_DATABASE,
@@ -74,9 +73,9 @@ class CheckResult(Reported, Stated):
     """The verdict on a model, with the evidence for it."""
 
     model: ColmapModel
-    cameras: list[CameraRow]
+    cameras: Table[CameraRow]
     """One row per image, those with a pose first; the reason says what is weak about a camera."""
-    pairs: list[PairRow]
+    pairs: Table[PairRow]
     """One row per pair that was looked at."""
     quality: ImageQuality
     facts: CheckedFacts
@@ -205,13 +204,14 @@ def compare_with_other(state: CheckState) -> CheckState:
     if second is None:
         return state
     grade = other.source.models[other.number].verdict.grade
-    second = second._replace(grade=grade, folder=str(other.number))
+    second = replace(second, grade=grade, folder=str(other.number))
     elsewhere = [*second.wrong, *second.undecided]
-    if len(elsewhere) == 1:  # several that are wrong together see false points together
-        doubted = np.isin(np.arange(images.num_images), elsewhere)
-        if ask_pixels(state.source, state.structure, doubted).any():
-            second = second._replace(wrong=second.wrong[:0], undecided=second.undecided[:0])
-    return replace(state, evidence=state.evidence.beside(second, fits.sides[1]))
+    # Several that are wrong together see false points together.
+    if len(elsewhere) == 1 and ask_pixels(state.source, state.structure, elsewhere):
+        second = replace(second, wrong=(), undecided=())
+    names, (_, against) = state.images.names, fits.sides
+    contradicting = [(names[i], names[j]) for i, j in against.tolist()]
+    return replace(state, evidence=state.evidence.beside(second, contradicting))
 
 
 def grade_model(state: CheckState, clock: Clock) -> CheckState:
@@ -231,11 +231,11 @@ def grade_model(state: CheckState, clock: Clock) -> CheckState:
 def finish_check(state: CheckState, clock: Clock) -> CheckResult:
     """Return the result: tables of cameras and pairs, and the figures."""
     model, source, fits, quality = state.model, state.source, state.fits, state.quality
-    pairs = [] if fits is None else _pair_rows(state.images, fits)
+    pairs = _pair_rows(state.images, fits)
     named = [one for one in state.reasons if one.of_each and one.kind is not Kind.SECOND_OPINION]
-    cameras = _camera_rows(model, pairs, [*state.weak, *(one for one in named if one not in state.weak)])
-    evidence = tell_evidence(state.evidence, state.images)
-    error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
+    cameras = _camera_rows(model, fits, [*state.weak, *(one for one in named if one not in state.weak)])
+    residuals_deg = pairs.columns["residual_deg"]
+    error_deg = _median(residuals_deg[np.isfinite(residuals_deg)].tolist())
     errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
     facts = CheckedFacts(
         inputs=source.inputs.facts,
@@ -259,8 +259,8 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
         median_track_length=_median(quality.point_track_lengths.tolist()),
         residual_level_deg=np.nan if fits is None else fits.level_deg,
         timings_s=clock.seconds,
-        evidence=evidence,
-        warnings=[*model.notes, *source.matches.notes, *evidence.statements],
+        evidence=state.evidence,
+        warnings=[*model.notes, *source.matches.notes, *state.evidence.statements],
     )
     return CheckResult(
         model=model,
@@ -281,42 +281,44 @@ def _of_alike_pictures(findings: Iterable[Reason]) -> Iterator[Reason]:
     yield from (replace(one, grade=min(one.grade, Grade.LOOK, key=list(Grade).index)) for one in findings)
 
 
-def _pair_rows(images: Images, fits: PairFits) -> list[PairRow]:
-    rows, directions = [], fits.directions
-    for e, status in enumerate(directions.status):
-        i, j = directions.pairs[e]
-        is_judged = bool(np.isfinite(fits.residuals_deg[e]))
-        rows.append(
-            PairRow(
-                name1=images.names[i],
-                name2=images.names[j],
-                direction=tuple(directions.directions[e].tolist()) if is_judged else (),
-                support=int(directions.num_inliers[e]),
-                residual_deg=float(fits.residuals_deg[e]),
-                verdict=(Verdict.OUTLIER if fits.contradicts[e] else Verdict.INLIER).value,
-                reason="" if is_judged else status.value,
-            )
-        )
-    return rows
+def _pair_rows(images: Images, fits: PairFits | None) -> Table[PairRow]:
+    """Return a row per pair; none without any."""
+    if fits is None:
+        return Table(PairRow, 3, {"name1": []})
+    directions, is_judged = fits.directions, np.isfinite(fits.residuals_deg)
+    columns = {
+        "name1": images.names_of(directions.pairs[:, 0]),
+        "name2": images.names_of(directions.pairs[:, 1]),
+        "direction": np.where(is_judged[:, None], directions.directions, np.nan),
+        "support": directions.num_inliers,
+        "residual_deg": fits.residuals_deg,
+        "verdict": np.where(fits.contradicts, Verdict.OUTLIER.value, Verdict.INLIER.value),
+        "reason": np.where(is_judged, "", [status.value for status in directions.status]),
+    }
+    return Table(PairRow, 3, columns)
 
 
-def _camera_rows(model: ColmapModel, pairs: list[PairRow], weak: list[Reason]) -> list[CameraRow]:
+def _camera_rows(model: ColmapModel, fits: PairFits | None, weak: list[Reason]) -> Table[CameraRow]:
     """Return a row per image, those with a pose first."""
-    names = model.images.names
-    degrees = Counter(name for pair in pairs if pair.direction for name in (pair.name1, pair.name2))
-    rows = [
-        CameraRow(
-            name=name,
-            placed=True,
-            reason="; ".join(one.sentence for one in weak if name in one.images),
-            piece=0,
-            center=tuple(center),
-            degree=degrees[name],
-        )
-        for name, center in zip(names, model.images.centers.tolist(), strict=True)
-    ]
-    others = set(model.image_names) - set(names)
-    return rows + [CameraRow(name=name, reason="it has no pose in the model") for name in sorted(others)]
+    names, others = model.images.names, sorted(set(model.image_names) - set(model.images.names))
+    judged = np.zeros((0, 2), dtype=np.int64)
+    if fits is not None:
+        judged = fits.directions.pairs[np.isfinite(fits.residuals_deg)]
+    clauses: dict[str, list[str]] = {name: [] for name in names}
+    for one in weak:
+        for name in one.images:
+            clauses.setdefault(name, []).append(one.sentence)
+    columns = {
+        "name": names,
+        "placed": [True] * len(names),
+        "reason": ["; ".join(clauses[name]) for name in names],
+        "piece": [0] * len(names),
+        "center": model.images.centers,
+        "degree": np.bincount(judged.ravel(), minlength=len(names)),
+    }
+    reasons = ["it has no pose in the model"] * len(others)
+    unposed = Table(CameraRow, 3, {"name": others, "reason": reasons})
+    return Table(CameraRow, 3, columns).followed_by(unposed)
 
 
 def _reasons(state: CheckState) -> Iterator[Reason]:
@@ -339,9 +341,7 @@ def _reasons(state: CheckState) -> Iterator[Reason]:
     yield from against
     if fits is not None and not any(one.grade is Grade.DO_NOT_USE for one in against):
         yield from _none_agrees(fits, source)
-    confirmed = [] if evidence.second is None else evidence.second.confirmed.tolist()
-    right = {model.images.names[k] for k in confirmed}
-    yield from (one for one in state.weak if not right.issuperset(one.images))
+    yield from (one for one in state.weak if not evidence.opinion.confirmed.issuperset(one.images))
     if pointless:
         clause = "it has no 3D points, so that only matches say where its cameras stand"
         yield of_model(Kind.POINTS, clause)

@@ -130,10 +130,11 @@ def find_remedies(result: LocateResult, inputs: RunInputs, source: MatchSource) 
     """Yield what to start from instead, where something can be done about what speaks against a result."""
     images, intrinsics, options = source.images, inputs.intrinsics, inputs.options
     may_free = options.freedom.intrinsics != "held" and options.freedom.adjusts_cameras(images.num_images)
+    wrong = {one.camera: one for one in result.evidence.lenses}
     freed = {
-        wrong.lens: wrong
-        for wrong in result.evidence.lenses
-        if may_free and images.lenses[wrong.lens].is_adjustable and not intrinsics.parts[wrong.lens, FOCAL]
+        row: wrong[lens.id]
+        for row, lens in enumerate(images.lenses)
+        if may_free and lens.id in wrong and lens.is_adjustable and not intrinsics.parts[row, FOCAL]
     }
     if freed and ask_resolution(source) is not None:
         freed = {}  # pixels of another resolution ask for another focal length, and are no fault of the lens
@@ -144,28 +145,26 @@ def find_remedies(result: LocateResult, inputs: RunInputs, source: MatchSource) 
     if not (freed or moved):
         return
     lenses, parts = list(images.lenses), intrinsics.parts.copy()
-    for row, wrong in freed.items():
+    for row, asked in freed.items():
         known = lenses[row]
         if known.origin in (None, Origin.CALIBRATION):  # what is contradicted pulls no harder than a guess
             known = replace(known.in_doubt(Origin.GUESS), origin=Origin.CALIBRATION)
-        lenses[row] = known.longer(wrong.factor)
+        lenses[row] = known.longer(asked.factor)
         parts[row, FOCAL] = True
-    pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(place.pairs_here for place in moved)])
-    names = ((images.names[i], images.names[j]) for i, j in pairs.tolist())
-    left_out = source.inputs.left_out | {(min(pair), max(pair)) for pair in names}
+    pairs = (pair for place in moved for pair in place.pairs_here)
+    left_out = source.inputs.left_out | {(min(pair), max(pair)) for pair in pairs}
     read = replace(source.inputs, left_out=left_out)
     view = source.matches.at(images.with_lenses(lenses), left_out, source.memory_plan.reading)
     yield Remedy(
         replace(inputs, intrinsics=replace(intrinsics, parts=parts)),
         replace(source, inputs=read, view=view),
-        {row: wrong.sigma for row, wrong in freed.items()},
-        tuple(images.names[place.camera] for place in moved),
+        {row: asked.sigma for row, asked in freed.items()},
+        tuple(place.image for place in moved),
     )
 
 
 def _count(result: LocateResult) -> int:
     """Return the number of lenses and cameras that evidence names, and of cameras that are left out."""
     evidence, left_out = result.evidence, int(np.sum(~result.kept))
-    apart = sum(len(seam.cameras) for seam in evidence.seams)
-    apart += sum(len(group.cameras) for group in evidence.untied)
+    apart = sum(map(len, evidence.apart))
     return len(evidence.lenses) + left_out + len(evidence.places) + apart

@@ -1,6 +1,5 @@
 """From placed cameras to cameras with points, adjusted if asked for, in their gauge."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.support import (
-    ObservationShares,
+    EvidenceShares,
     PartnerCounts,
     Support,
     images_of_few_points,
@@ -51,7 +50,7 @@ def seed_points(state: ModelState, clock: Clock, confirmed: BoolArray | None = N
         least[images.frame_of[confirmed]] = (least[images.frame_of[confirmed]] + 1) // 2
     seen = images_of_few_points(points, images, least, fixed)
     images, points = _leave_out(seen >= 0, images, points)
-    unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)
+    unsupported, shares = np.zeros(len(seen), dtype=np.bool_), EvidenceShares()
     if source.has_database:
         if (seen >= 0).any():  # which were partners of others
             partners = _count(state.read_links(images, nobody), images, partners.anew(images))
@@ -89,7 +88,8 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
         points = filter_points(points, posed, state.pictures(images, rows), options.structure)
     if bundle is not None:
         assert points.errors_px is not None
-        bundle = replace(bundle, final_error_px=float(points.errors_px.mean()))
+        final = replace(bundle.solves, final_error_px=float(points.errors_px.mean()))
+        bundle = replace(bundle, solves=final)
     return images, replace(points, images=rows[points.images]), bundle, partners
 
 

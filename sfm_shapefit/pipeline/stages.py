@@ -201,5 +201,5 @@ def examine_model(state: ModelState, clock: Clock) -> ModelState:
         if shape is not None:
             judged = replace(judged, open_covariances=open_beyond_noise(state, shape))
         for group in (group for group in evidence.untied if group.is_loose):
-            judged = judged.loosened(np.isin(judged.cameras, group.cameras))
+            judged = judged.loosened(state.images.are_named(group.images)[judged.cameras])
         return replace(state, placement=judged, evidence=replace(evidence, shape=shape))

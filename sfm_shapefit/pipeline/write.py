@@ -24,8 +24,8 @@ from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.map_result import JoinedModel, MapResult
 from sfm_shapefit.facts.placed import IN_MEMORY, folder_of
 from sfm_shapefit.facts.result import GraphResult, LocateResult
-from sfm_shapefit.facts.rows import covariance_of, covariances_text, own_camera_rows
-from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
+from sfm_shapefit.facts.rows import covariances_of, covariances_text, own_camera_rows
+from sfm_shapefit.facts.tables import CameraRow, Table, write_rows
 from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
 from sfm_shapefit.files.options import MADE_FIRST, SIDECARS
@@ -191,22 +191,22 @@ def _write_files(
             rows = piece.own_cameras
         else:
             rows = own_camera_rows(piece, piece.locations, 1.0)
-        _write_cameras(rows, found.dimension, subfolder)
-    _write_cameras(found.cameras, found.dimension, folder)
-    write_rows(found.pairs, PairRow, found.dimension, folder / "pairs.csv")
+        _write_cameras(rows, subfolder)
+    _write_cameras(found.cameras, folder)
+    write_rows(found.pairs, folder / "pairs.csv")
     if isinstance(found, LocateResult) and found.doubtful_pairs:
-        write_rows(found.doubtful_pairs, PairRow, found.dimension, folder / "doubtful_pairs.csv")
+        write_rows(found.doubtful_pairs, folder / "doubtful_pairs.csv")
     write_json(found.facts.summary(), folder / MARKER)
     if options.report:
         _write_report(found, folder / "report.html", options.images)
 
 
-def _write_cameras(rows: Sequence[CameraRow], dimension: int, folder: Path) -> None:
+def _write_cameras(rows: Table[CameraRow], folder: Path) -> None:
     """Write cameras.csv and, in space and where any is known, the covariances of centers."""
-    write_rows(rows, CameraRow, dimension, folder / "cameras.csv")
-    known = {row.name: covariance_of(row) for row in rows if dimension == len(row.sigma) == 3}
-    known = {name: one for name, one in known.items() if np.isfinite(one).all()}
-    if known:
+    write_rows(rows, folder / "cameras.csv")
+    every = zip(rows.columns["name"], covariances_of(rows), strict=True)
+    known = {name: one for name, one in every if np.isfinite(one).all()}
+    if known and rows.dimension == 3:
         text = covariances_text(known)
         (folder / "covariances.csv").write_text(text, encoding="utf-8", errors="backslashreplace")
 

@@ -24,7 +24,7 @@ from sfm_shapefit.base.geometry import (
     rotation_angles_deg,
 )
 from sfm_shapefit.placement.prior_readings import better_reading
-from sfm_shapefit.scene.given import Datum, PositionPriors
+from sfm_shapefit.scene.given import EarthDatum, PositionPriors
 
 _CAP_OF_SIZE = 0.5  # spreads of all input centers; one that is farther off is lost and must not set the scale
 _ROUGH = 0.1  # spreads; the scale is rough if the input's centers are off by more, in the median
@@ -80,7 +80,7 @@ class Gauge:
     """Why the scale may be rough, if it may."""
     scale_sigma: float | None = None
     """Relative standard deviation of the scale, where that is measured and its error known."""
-    datum: Datum | None = None
+    datum: EarthDatum | None = None
     """Where the output's origin is on Earth, if priors on Earth set it."""
     has_priors: bool = False
     """Whether position priors set the origin and, as far as they tell them, the axes."""

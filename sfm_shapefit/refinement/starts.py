@@ -47,7 +47,7 @@ from sfm_shapefit.solver.options import PAIRS_AT_SCALE, SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.splitting.linear import Resources
-from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
+from sfm_shapefit.solver.splitting.lud import Lud, solve_lud
 
 COLLAPSED = 0.3
 """Disagreement of the starts beyond which one has collapsed; see `disagreement`."""
@@ -124,7 +124,7 @@ class RefinedPlacement:
     reset_nodes: IntArray
     """Nodes that the refinement moved far out, ascending; they are where LUD, or else the start, has them
     instead, and nothing says that they belong there."""
-    lud: LudResult | None
+    lud: Lud | None
     """The second start, with its own dual bound (0 where that was not computed)."""
     posterior: FloatArray
     """(m,) probability that each direction is right, by its residual and those of all (`consensus`)."""
@@ -459,7 +459,7 @@ def _plan_normal_solver(
 
 def _find_second_start(
     measured: MeasuredGraph, threads: int, certified: bool
-) -> tuple[LudResult | None, FloatArray | None]:
+) -> tuple[Lud | None, FloatArray | None]:
     """Return LUD's solution after a few steps, which groups have none of, and its locations, if usable."""
     graph, classes, groups = measured.graph, measured.classes, measured.groups
     if groups is None and not has_second_start(graph):

@@ -15,8 +15,8 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, normalized
-from sfm_shapefit.facts.rows import covariance_of
-from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.facts.rows import covariances_of
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.scene.images import Images
@@ -194,8 +194,8 @@ class Drawing:
 
 
 def build_drawing(
-    cameras: Sequence[CameraRow],
-    pairs: Sequence[PairRow],
+    cameras: Table[CameraRow],
+    pairs: Table[PairRow],
     *,
     poses: Poses | None = None,
     points: PickedPoints | None = None,
@@ -291,52 +291,42 @@ def _unknown_poses(n: int) -> Poses:
     )
 
 
-def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
-    centers, covariances = np.full((len(rows), 3), np.nan), np.full((len(rows), 3, 3), np.nan)
-    for k, row in enumerate(rows):
-        if row.center:
-            centers[k] = [*row.center, 0.0, 0.0][:3]
-        if row.sigma:
-            covariances[k] = covariance_of(row)
+def _cameras(rows: Table[CameraRow], poses: Poses) -> Cameras:
+    columns, centers = rows.columns, np.zeros((len(rows), max(rows.dimension, 3)))
+    centers[:, : rows.dimension] = columns["center"]
+    centers[np.isnan(columns["center"]).any(axis=1)] = np.nan
     return Cameras(
-        names=tuple(row.name for row in rows),
-        placed=np.array([row.placed for row in rows], dtype=np.bool_),
-        reasons=tuple(row.reason for row in rows),
-        pieces=np.array([-1 if row.piece is None else row.piece for row in rows], dtype=np.int64),
-        degrees=np.array([row.degree for row in rows], dtype=np.int64),
-        trust=np.array([row.trust for row in rows], dtype=np.float64),
-        centers=centers,
-        covariances=covariances,
+        names=tuple(columns["name"]),
+        placed=columns["placed"],
+        reasons=tuple(columns["reason"]),
+        pieces=np.array([-1 if piece is None else piece for piece in columns["piece"]], dtype=np.int64),
+        degrees=columns["degree"],
+        trust=columns["trust"],
+        centers=centers[:, :3],
+        covariances=covariances_of(rows),
         poses=poses,
     )
 
 
-def _pairs(rows: Sequence[PairRow], cameras: Cameras, certified: FloatArray | None) -> Pairs:
-    row_of = {name: k for k, name in enumerate(cameras.names)}
-    ends = np.array([(row_of[row.name1], row_of[row.name2]) for row in rows], dtype=np.int64).reshape(-1, 2)
-    dimension = max((len(row.direction) for row in rows), default=0) or 3
-    nothing = (np.nan,) * dimension
-    directions = np.array([row.direction or nothing for row in rows]).reshape(-1, dimension)
+def _pairs(rows: Table[PairRow], cameras: Cameras, certified: FloatArray | None) -> Pairs:
+    row_of, columns = {name: k for k, name in enumerate(cameras.names)}, rows.columns
+    ends = np.array([[row_of[name] for name in columns[end]] for end in ("name1", "name2")], dtype=np.int64).T
+    directions, undetermined = columns["direction"], columns["verdict"] == Verdict.UNDETERMINED.value
+    is_known = np.isfinite(directions).all(axis=1)
+    kinds = PairClass.NO_DIRECTION, PairClass.UNDETERMINED, PairClass.CONTRADICTS
+    classes = np.select([~is_known, undetermined, contradicting(rows)], kinds, PairClass.AGREES)
     return Pairs(
         cameras=ends,
-        classes=np.array([_class_of(row) for row in rows], dtype=np.int64),
-        support=np.array([row.support for row in rows], dtype=np.int64),
-        weights=np.array([row.scores.weight for row in rows], dtype=np.float64),
-        leverages=np.array([row.scores.leverage for row in rows], dtype=np.float64),
-        dual_norms=np.array([row.scores.dual_norm for row in rows], dtype=np.float64),
-        residuals_deg=np.array([row.residual_deg for row in rows], dtype=np.float64),
+        classes=classes.astype(np.int64),
+        support=columns["support"],
+        weights=columns["weight"],
+        leverages=columns["leverage"],
+        dual_norms=columns["dual_norm"],
+        residuals_deg=columns["residual_deg"],
         certified_deg=_angles_at(certified, ends, directions),
-        input_deg=_angles_at(cameras.poses.centers if dimension == 3 else None, ends, directions),
-        reasons=tuple(row.reason for row in rows),
+        input_deg=_angles_at(cameras.poses.centers if rows.dimension == 3 else None, ends, directions),
+        reasons=tuple(columns["reason"]),
     )
-
-
-def _class_of(row: PairRow) -> PairClass:
-    if not row.direction:
-        return PairClass.NO_DIRECTION
-    if row.verdict == Verdict.UNDETERMINED.value:
-        return PairClass.UNDETERMINED
-    return PairClass.CONTRADICTS if row.contradicts else PairClass.AGREES
 
 
 def _angles_at(locations: FloatArray | None, ends: IntArray, directions: FloatArray) -> FloatArray:

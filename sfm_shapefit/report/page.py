@@ -23,11 +23,11 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.record import plain
 from sfm_shapefit.base.settings import flat_values
-from sfm_shapefit.facts.evidence import ToldEvidence
 from sfm_shapefit.facts.model import FactsOfModel, JoinedFacts
 from sfm_shapefit.facts.options import LocateOptions, MapOptions
 from sfm_shapefit.facts.placed import Facts, GraphFacts, Piece
 from sfm_shapefit.files.colmap.seed import PickedPoints
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.report.charts import (
     MOST_CELLS,
     pack_array,
@@ -193,7 +193,7 @@ def _cameras(drawing: Drawing, order: IntArray, display: _Display, reasons: dict
 
 def _doubts(drawing: Drawing, facts: Facts, order: IntArray, display: _Display) -> dict[str, Any]:
     """Return which groups stand apart from the rest, and where else two sets of pairs put a camera."""
-    evidence = facts.evidence if isinstance(facts, FactsOfModel) else ToldEvidence()
+    evidence = facts.evidence if isinstance(facts, FactsOfModel) else ModelEvidence()
     row_of = {name: k for k, name in enumerate(drawing.cameras.names)}
     groups = np.full(len(row_of), -1)
     groups[[row_of[name] for name in getattr(evidence.second, "wrong", ())]] = len(evidence.apart)

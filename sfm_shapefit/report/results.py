@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import GraphResult, LocateResult
-from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.files.colmap.seed import pick_points
 from sfm_shapefit.judgement.image_quality import ImageQuality
@@ -24,7 +24,7 @@ def draw_result(found: LocateResult | GraphResult) -> Drawing:
     placement, poses, points = found.placement, None, None
     if isinstance(found, LocateResult):
         poses, points = (
-            poses_of(found.images, [row.name for row in found.cameras]),
+            poses_of(found.images, list(found.cameras.columns["name"])),
             pick_points(found.model, MAX_POINTS),
         )
         if isinstance(found.options, MapOptions):  # a database has no positions, or those of sensors in rigs
@@ -49,7 +49,7 @@ def draw_joined(found: JoinedModel) -> Drawing:
 
 
 def draw_checked(
-    model: ColmapModel, cameras: Sequence[CameraRow], pairs: Sequence[PairRow], quality: ImageQuality
+    model: ColmapModel, cameras: Table[CameraRow], pairs: Table[PairRow], quality: ImageQuality
 ) -> Drawing:
     """Return the drawing of a model that was judged, with how well points hold each of its images."""
     drawing = _draw_as_it_stands(model, cameras, pairs)
@@ -60,18 +60,17 @@ def draw_checked(
 def draw_model(model: ColmapModel, trust: Mapping[str, float]) -> Drawing:
     """Return the drawing of a model's posed images and points, without pairs; `trust` is by image name."""
     images = model.images
-    rows = [
-        CameraRow(name=name, placed=True, center=tuple(center), trust=trust.get(name, math.nan))
-        for name, center in zip(images.names, images.centers.tolist(), strict=True)
-    ]
+    told = {"name": images.names, "placed": images.is_posed, "center": images.centers}
+    known = {"trust": [trust.get(name, math.nan) for name in images.names]}
+    rows, pairs = Table(CameraRow, 3, told | known), Table(PairRow, 3, {"name1": []})
     return build_drawing(
-        rows, [], poses=poses_of(images, images.names), points=pick_points(model.arrays, MAX_POINTS)
+        rows, pairs, poses=poses_of(images, images.names), points=pick_points(model.arrays, MAX_POINTS)
     )
 
 
-def _draw_as_it_stands(model: ColmapModel, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Drawing:
+def _draw_as_it_stands(model: ColmapModel, cameras: Table[CameraRow], pairs: Table[PairRow]) -> Drawing:
     """Return the drawing of a model that is the input itself, so that there is nothing to compare it with."""
-    poses = poses_of(model.images, [row.name for row in cameras])
+    poses = poses_of(model.images, list(cameras.columns["name"]))
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
     points = pick_points(model.arrays, MAX_POINTS)
     return replace(build_drawing(cameras, pairs, poses=poses, points=points), lenses=_lenses(model.images))

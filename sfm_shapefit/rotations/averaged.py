@@ -1,13 +1,34 @@
 """Rotations averaged from relative ones, and how far they can be believed."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
+
+
+class Averaging(Record):
+    """How rotations were averaged, and how well they agree with the pairs."""
+
+    statement: Annotated[str, "How the rotations were found, in words."]
+    num_registered: Annotated[int, "Images that have a rotation."]
+    num_pairs: Annotated[int, "Pairs whose residuals count."]
+    agreeing_share: Annotated[float, "Share of the pairs, by the square root of their matches, that agree."]
+    num_unsettled: Annotated[int, "Images that most of their pairs contradict, in every answer tried."]
+    median_sigma_deg: Annotated[float | None, "Median standard deviation of a rotation; null if not known."]
+    num_tried: Annotated[int, "Averagings of which this one is the most consistent."]
+    certified: Annotated[
+        bool | None, "Whether no rotations fit the kept pairs better; null if that was not checked."
+    ]
+    num_repeated_pairs: Annotated[
+        int,
+        "Pairs set aside since they would fold the images together, and lack matches that they should share.",
+    ]
+    num_rival_pairs: Annotated[int, "Pairs of another arrangement of the images that is as likely."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -84,21 +105,19 @@ class AveragedRotations(Displayed):
         proof = "proved to be the best for" if self.certified else "not proved to be the best for"
         return f"{text}; {proof} the pairs that are kept"
 
-    def summary(self) -> dict[str, Any]:
-        """Return the facts in plain values."""
+    @property
+    def facts(self) -> Averaging:
+        """What is told of the answer."""
         known = self.sigmas_deg[np.isfinite(self.sigmas_deg)]
-        return {
-            "statement": self.statement,
-            "num_registered": int(self.registered.sum()),
-            "num_pairs": self.num_pairs,
-            "agreeing_share": self.share,
-            "num_unsettled": int(self.unsettled.sum()),
-            "median_sigma_deg": float(np.median(known)) if len(known) else None,
-            "num_tried": self.num_tried,
-            "certified": self.certified,
-            "num_repeated_pairs": self.num_repeated,
-            "num_rival_pairs": self.num_rivals,
-        }
+        return Averaging.taken_from(
+            self,
+            num_registered=int(self.registered.sum()),
+            agreeing_share=self.share,
+            num_unsettled=int(self.unsettled.sum()),
+            median_sigma_deg=float(np.median(known)) if len(known) else None,
+            num_repeated_pairs=self.num_repeated,
+            num_rival_pairs=self.num_rivals,
+        )
 
     def _headline(self) -> str:
         return (

@@ -16,14 +16,14 @@ the chain agrees with one another. Checked on `scripts/results/notes.md#loops-of
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.forests import connected_components
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -65,33 +65,35 @@ class Videos(NamedTuple):
         return Videos(video_of, np.where(video_of >= 0, self.time_of, -1))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Visit:
-    """Loop pairs between two stretches of a video."""
+class Loop(Record):
+    """Pairs between two stretches of a video that are far apart in time, by the names of their frames."""
 
-    first: tuple[int, int]
-    """The first and the last image of the earlier stretch."""
-    second: tuple[int, int]
-    """The first and the last image of the later one."""
-    num_pairs: int
-    num_matches: int
-    num_refused: int
-    """Number of its pairs that were refused: all, or those that do not agree with the chain."""
-    angle_deg: float
-    """Median angle between the relative rotations of its pairs and those of the chain."""
-    tolerance_deg: float
-    """Up to where these pairs would agree with the chain, on average."""
+    first: Annotated[tuple[str, ...], "First and last frame of the earlier stretch."]
+    second: Annotated[tuple[str, ...], "First and last frame of the later stretch."]
+    num_pairs: Annotated[int, "Pairs between the two."]
+    num_matches: Annotated[int, "Their inlier matches."]
+    num_refused: Annotated[int, "Pairs left out, as they do not agree with the chain of pairs near in time."]
+    angle_deg: Annotated[float, "Median angle between their relative rotations and the chain's."]
+    tolerance_deg: Annotated[float, "Largest angle that counts as agreeing."]
 
     @property
-    def taken(self) -> bool:
-        """Whether any of its pairs is used."""
-        return self.num_refused < self.num_pairs
+    def cells(self) -> list[str]:
+        """Its two stretches, pairs, matches, angle and fate, as the report has them in a row."""
+        refused, total = self.num_refused, self.num_pairs
+        fate = "taken" if refused == 0 else "refused" if refused == total else f"taken but for {refused}"
+        angle = f"{self.angle_deg:.2g} (up to {self.tolerance_deg:.2g} agree)"
+        return [*self.stretches, str(total), str(self.num_matches), angle, fate]
+
+    @property
+    def stretches(self) -> list[str]:
+        """Its two stretches, each by its first and last frame."""
+        return [" \N{EN DASH} ".join(dict.fromkeys(frames)) for frames in (self.first, self.second)]
 
 
 class Loops(NamedTuple):
     """What became of the loops of all videos."""
 
-    visits: tuple[Visit, ...]
+    loops: tuple[Loop, ...]
     """Video by video, by the time of their first frames."""
     refused: IntArray
     """Rows of the pairs that are not to be used."""
@@ -128,10 +130,13 @@ def confirm_videos(videos: Videos, relative: RelativeRotations) -> Videos:
     return videos.subset(confirmed)
 
 
-def judge_loops(videos: Videos, relative: RelativeRotations, threads: int = 1) -> Loops:
-    """Return which loops of videos agree with the chain of neighbors; other pairs are not judged."""
+def judge_loops(videos: Videos, names: Sequence[str], relative: RelativeRotations, threads: int = 1) -> Loops:
+    """Return which loops of videos, of images `names` (n,), agree with the chain of neighbors.
+
+    Other pairs are not judged.
+    """
     is_loop = loop_pairs(videos, relative)
-    visits: list[Visit] = []
+    judged: list[Loop] = []
     refused = [np.zeros(0, dtype=np.int64)]
     for video in range(videos.num_videos):
         rows = np.flatnonzero(videos.video_of[relative.pairs[:, 0]] == video)
@@ -147,10 +152,10 @@ def judge_loops(videos: Videos, relative: RelativeRotations, threads: int = 1) -
         angles, tolerances = _compare(videos, averaged, relative.subset(loops))
         finite = np.isfinite(angles)
         loops, angles, tolerances = loops[finite], angles[finite], tolerances[finite]
-        verdict = _judge_visits(videos, relative.subset(loops), angles, tolerances)
-        visits += verdict[0]
+        verdict = _judge_visits(videos, names, relative.subset(loops), angles, tolerances)
+        judged += verdict[0]
         refused.append(loops[verdict[1]])
-    return Loops(tuple(visits), np.sort(np.concatenate(refused)))
+    return Loops(tuple(judged), np.sort(np.concatenate(refused)))
 
 
 def loop_pairs(videos: Videos, relative: RelativeRotations) -> BoolArray:
@@ -209,10 +214,10 @@ def _compare(
 
 
 def _judge_visits(
-    videos: Videos, loops: RelativeRotations, angles: FloatArray, tolerances: FloatArray
-) -> tuple[list[Visit], BoolArray]:
-    """Return the visits of a video, and which of its loop pairs are refused."""
-    refused, visits = angles > tolerances, []
+    videos: Videos, names: Sequence[str], loops: RelativeRotations, angles: FloatArray, tolerances: FloatArray
+) -> tuple[list[Loop], BoolArray]:
+    """Return the visits of a video by their time, and which of its loop pairs are refused."""
+    refused, visits = angles > tolerances, list[tuple[list[int], Loop]]()
     if len(loops.pairs) == 0:
         return [], refused
     times = np.sort(videos.time_of[loops.pairs], axis=1)
@@ -224,19 +229,18 @@ def _judge_visits(
         if 2 * counts[~refused[rows]].sum() <= counts.sum():
             refused[rows] = True
         ends = np.sort(times[rows], axis=0)[[0, -1]]
-        (a, b), (c, d) = ends.T.tolist()
-        visits.append(
-            Visit(
-                first=(image_at[a], image_at[b]),
-                second=(image_at[c], image_at[d]),
-                num_pairs=len(rows),
-                num_matches=int(counts.sum()),
-                num_refused=int(refused[rows].sum()),
-                angle_deg=float(np.median(angles[rows])),
-                tolerance_deg=float(np.mean(tolerances[rows])),
-            )
+        first, second = (tuple(names[image_at[time]] for time in side) for side in ends.T.tolist())
+        loop = Loop(
+            first=first,
+            second=second,
+            num_pairs=len(rows),
+            num_matches=int(counts.sum()),
+            num_refused=int(refused[rows].sum()),
+            angle_deg=float(np.median(angles[rows])),
+            tolerance_deg=float(np.mean(tolerances[rows])),
         )
-    return sorted(visits, key=lambda visit: videos.time_of[list(visit.first)].tolist()), refused
+        visits.append((ends[:, 0].tolist(), loop))
+    return [loop for _, loop in sorted(visits, key=lambda visit: visit[0])], refused
 
 
 def _group(times: IntArray) -> IntArray:

@@ -1,21 +1,27 @@
 """What a user knows of the images beside the matches: positions, control points, gravity; types only."""
 
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
 from sfm_shapefit.base.geometry import principal_lengths
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.scene.known_positions import KnownPositions
 
 
-class Datum(NamedTuple):
-    """A point on Earth: the origin of axes east, north and up, in meters."""
+class EarthDatum(Record):
+    """A point on the WGS84 ellipsoid: the origin of axes east, north and up, in meters."""
 
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
+    latitude_deg: Annotated[float, "Geodetic latitude."]
+    longitude_deg: Annotated[float, "Longitude, east of Greenwich."]
+    altitude_m: Annotated[float, "Height above the ellipsoid, or what the priors give for it."]
+
+    @property
+    def geodetic(self) -> tuple[float, float, float]:
+        """Latitude and longitude in degrees, and altitude in meters."""
+        return self.latitude_deg, self.longitude_deg, self.altitude_m
 
     @property
     def statement(self) -> str:
@@ -32,7 +38,7 @@ class PositionPriors:
     """By camera."""
     statement: str
     """Where they come from, and what their axes are."""
-    datum: Datum | None = None
+    datum: EarthDatum | None = None
     """Where their origin is on Earth, if that is known."""
     notes: tuple[str, ...] = ()
     """What was read otherwise than it stands, or not at all, a sentence each."""
@@ -72,7 +78,7 @@ class ControlPoints:
     """(m, 2)"""
     statement: str
     """Where they come from, and what their axes are."""
-    datum: Datum | None = None
+    datum: EarthDatum | None = None
     """Where their origin is on Earth, if that is known."""
 
     def of(self, images: IntArray) -> "ControlPoints":

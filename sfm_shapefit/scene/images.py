@@ -13,7 +13,7 @@ an image of frame f through lens l, the coordinates
     x = R_l R_f (X - C_f) + t_l,        (R_l, t_l) = sensor_from_rig of the lens, the identity of a reference.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -155,9 +155,33 @@ class Images:
         return np.asarray(self.frames.centers[self.frame_of] + self.offsets)
 
     @property
+    def camera_ids(self) -> IntArray:
+        """COLMAP's ids of the lenses that took the images, (i,)."""
+        return np.array([lens.id for lens in self.lenses], dtype=np.int64)[self.lens_of]
+
+    def names_of(self, rows: IntArray) -> tuple[str, ...]:
+        """Return the names of some images, by their rows (k,)."""
+        return tuple(self.names[k] for k in rows.tolist())
+
+    def are_named(self, names: Collection[str]) -> BoolArray:
+        """Return which images (i,) bear one of some names."""
+        chosen = frozenset(names)
+        return np.array([name in chosen for name in self.names], dtype=np.bool_)
+
+    @property
     def focal_lengths_px(self) -> FloatArray:
         """Mean focal lengths, (i,); of a lens without one, pixels per radian."""
         return np.array([lens.focal_px for lens in self.lenses], dtype=np.float64)[self.lens_of]
+
+    @property
+    def are_angular(self) -> BoolArray:
+        """Images in which the distance from the center grows with the angle, as of fisheyes, (i,)."""
+        return np.array([lens.is_angular for lens in self.lenses], dtype=np.bool_)[self.lens_of]
+
+    @property
+    def focal_widths(self) -> FloatArray:
+        """Mean focal lengths over the longer sides of the pictures, (i,); NaN where a size is not known."""
+        return np.array([lens.focal_widths for lens in self.lenses], dtype=np.float64)[self.lens_of]
 
     def differ_in_rays(self, other: "Images") -> bool:
         """Return whether the rays of a lens differ by a hundredth between the same images."""
@@ -190,7 +214,7 @@ class Images:
         frames, frame_of = np.unique(self.frame_of[images], return_inverse=True)
         lenses, lens_of = np.unique(self.lens_of[images], return_inverse=True)
         return Images(
-            names=tuple(self.names[k] for k in images.tolist()),
+            names=self.names_of(images),
             ids=self.ids[images],
             frame_of=frame_of.ravel(),
             lens_of=lens_of.ravel(),

@@ -12,13 +12,14 @@ its first eight, its values: fx, fy, cx, cy, and its first four coefficients, of
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.scene.wide_lenses import (
     ANGLE,
     DIVISION,
@@ -43,6 +44,8 @@ class _Model(NamedTuple):
     """Its projection, see `scene.wide_lenses`."""
     num_focal: int
     num_coefficients: int
+    bends: tuple[float, ...] = ()
+    """First coefficients to be tried where a lens that was guessed a plane may be a fisheye."""
 
 
 _LENS_MODELS = {
@@ -59,10 +62,10 @@ _LENS_MODELS = {
     "OPENCV_FISHEYE": _Model(ANGLE, 2, 4),
     "THIN_PRISM_FISHEYE": _Model(THIN_PRISM, 2, 8),
     "RAD_TAN_THIN_PRISM_FISHEYE": _Model(RAD_TAN, 2, 12),
-    "FOV": _Model(FOV, 2, 1),
-    "SIMPLE_DIVISION": _Model(DIVISION, 1, 1),
-    "DIVISION": _Model(DIVISION, 2, 1),
-    "EUCM": _Model(EUCM, 2, 2),
+    "FOV": _Model(FOV, 2, 1, (0.5, 1.0, 1.5)),
+    "SIMPLE_DIVISION": _Model(DIVISION, 1, 1, (-0.1, -0.3)),
+    "DIVISION": _Model(DIVISION, 2, 1, (-0.1, -0.3)),
+    "EUCM": _Model(EUCM, 2, 2, (0.4, 0.7)),
 }
 """All of pycolmap 4.2 but for EQUIRECTANGULAR, which has nothing to free."""
 ADJUSTED_ELSEWHERE = "intrinsics of this model are not adjusted here, but by COLMAP's bundle_adjuster"
@@ -151,9 +154,27 @@ class Lens:
         return self.is_adjustable and _LENS_MODELS[self.model].kind == PLANE
 
     @property
+    def is_angular(self) -> bool:
+        """Whether the distance from the center of its pictures grows with the angle, as of fisheyes."""
+        if self.is_adjustable:
+            return _LENS_MODELS[self.model].kind in (ANGLE, THIN_PRISM, RAD_TAN, FOV)
+        return self.is_panorama or "FISHEYE" in self.model
+
+    @property
+    def bends(self) -> tuple[float, ...]:
+        """First coefficients that make a fisheye of the lens, to be tried; empty of most models."""
+        return _LENS_MODELS[self.model].bends if self.is_adjustable else ()
+
+    @property
     def is_panorama(self) -> bool:
         """Whether its pictures show all directions, as longitude and latitude."""
         return self.model == "EQUIRECTANGULAR"
+
+    @property
+    def focal_widths(self) -> float:
+        """Focal length over the longer side of the picture; NaN where its size is not known."""
+        longer = max(self.width, self.height)
+        return self.focal_px / longer if longer else np.nan
 
     @property
     def focal_px(self) -> float:
@@ -207,7 +228,8 @@ class Lens:
             raise InputError(
                 f"lens model {self.model} cannot be adjusted; undistort it, or give one of {known}"
             )
-        wanted = 2 + sum(_LENS_MODELS[self.model][1:])
+        known_as = _LENS_MODELS[self.model]
+        wanted = 2 + known_as.num_focal + known_as.num_coefficients
         if len(self.parameters) != wanted or not np.isfinite(self.parameters).all():
             raise InputError(f"a lens of model {self.model} takes {wanted} finite parameters")
         if min(self.values()[:2]) <= 0.0:
@@ -215,7 +237,7 @@ class Lens:
 
     def row(self) -> FloatArray:
         """Return the numbers that a projection takes, (17,), see `scene.wide_lenses`; values come first."""
-        kind, num_focal, _ = _LENS_MODELS[self.model]
+        kind, num_focal, *_ = _LENS_MODELS[self.model]
         row, others = np.zeros(ROW), self.parameters[num_focal:]
         row[0], row[1], row[KIND] = self.parameters[0], self.parameters[num_focal - 1], kind
         row[2 : 2 + len(others)] = others
@@ -234,7 +256,7 @@ class Lens:
         """Return which of the values the model states by itself, (8,): fy is none where it is fx."""
         chosen = np.zeros(NUM_VALUES, np.bool_)
         if self.is_adjustable:
-            _, num_focal, num_coefficients = _LENS_MODELS[self.model]
+            _, num_focal, num_coefficients, _ = _LENS_MODELS[self.model]
             chosen[: 4 + num_coefficients] = True
             chosen[1] = num_focal == 2
         return chosen
@@ -364,12 +386,13 @@ def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float
     return np.where((step <= _STILL) & (u * u + v * v <= largest), [u, v], np.nan)
 
 
-class LensErrors(NamedTuple):
-    """What covariances take errors of the lenses for."""
+class LensErrors(Record):
+    """What the standard deviations take smooth errors of the lenses for, by what the residuals say."""
 
-    score: float
-    """Standard score of smooth errors that all images of a lens share, the largest of all lenses'."""
-    own_px: float
-    """Root of the mean square of the smooth errors of an image of its own; 0 where the lenses fit."""
-    shared_px: float
-    """The same of those that all images of a lens share, the largest of all lenses'."""
+    score: Annotated[
+        float,
+        "Standard score of errors that all images of a lens share, the largest; up to 3 they are noise, "
+        "from 4 on they count in full.",
+    ]
+    own_px: Annotated[float, "Errors of an image of its own, root of the mean square in pixels; 0 if none."]
+    shared_px: Annotated[float, "The same of errors that all images of a lens share."]

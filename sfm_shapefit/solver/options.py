@@ -3,9 +3,10 @@
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.settings import Settings, explained, option
 from sfm_shapefit.base.threads import MAX_THREADS, count_threads
 
@@ -144,6 +145,23 @@ class SolverOptions(Settings):
         return count_threads(self.threads)
 
 
+class Solve(Record):
+    """A certified ShapeFit solve: of the largest piece, or over pieces that are joined."""
+
+    status: Annotated[str, "converged, inaccurate, max_iterations or cancelled."]
+    objective: Annotated[float | None, "R(T) / L(T) of the paper at the ShapeFit optimum, dimensionless."]
+    dual_bound: Annotated[float | None, "No placement has a lower objective."]
+    gap: Annotated[float | None, "objective - dual_bound."]
+    equality_residual: Annotated[
+        float | None, "Violation of the dual's equality, relative to the largest weighted degree."
+    ]
+    unique: Annotated[bool | None, "Whether the certificate proves the optimum unique; null if not examined."]
+    iterations: Annotated[int, "Iterations of the solver that ran."]
+    seconds: Annotated[float, "Wall-clock time of the solve."]
+    method: Annotated[str, "The solver that ran."]
+    method_reason: Annotated[str, "Why it was chosen."]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class SolverResult(Displayed):
     """A solve's answer together with the evidence that it is one."""
@@ -182,11 +200,10 @@ class SolverResult(Displayed):
         """Whether the certified gap is below the tolerance."""
         return self.status is Status.CONVERGED
 
-    def summary(self) -> dict[str, Any]:
-        """Return the `solve` object of locate.json."""
-        figures = ("objective", "dual_bound", "gap", "equality_residual", "unique", "iterations", "seconds")
-        found = {name: getattr(self, name) for name in (*figures, "method", "method_reason")}
-        return {"status": self.status.name.lower(), **found}
+    @property
+    def facts(self) -> Solve:
+        """The `solve` object of locate.json."""
+        return Solve.taken_from(self, status=self.status.name.lower())
 
     def _headline(self) -> str:
         found = f"{len(self.locations)} locations, {self.status.name.lower()}"

@@ -4,7 +4,7 @@ import enum
 import math
 from typing import Annotated, Literal
 
-from sfm_shapefit.base.record import Record, dumps, schema_of
+from sfm_shapefit.base.record import Record, dumps, plain, schema_of
 
 
 class Color(enum.Enum):
@@ -61,3 +61,21 @@ def test_the_schema_has_each_record_once_with_the_sentences_of_its_fields():
     assert outer["properties"]["kind"] == {"enum": ["a", "b"], "description": "What it is."}
     assert outer["properties"]["parts"]["items"] == {"$ref": "#/$defs/Inner"}
     assert definitions["Inner"]["properties"]["length"]["anyOf"] == [{"type": "number"}, {"type": "null"}]
+
+
+class Measured(Record):
+    """A record that code computes with, too."""
+
+    num: Annotated[int, "How many."]
+    values: tuple[float, ...] = ()
+    """What they are."""
+
+
+def test_a_field_without_a_sentence_stands_in_no_json():
+    measured = Measured(num=2, values=(0.5, 1.5))
+    assert measured.values == (0.5, 1.5)
+    assert measured.summary() == plain(measured) == {"num": 2}
+    assert Measured.taken_from(measured) == measured
+    definitions = {}
+    schema_of(Measured, definitions, {})
+    assert [*definitions["Measured"]["properties"]] == definitions["Measured"]["required"] == ["num"]

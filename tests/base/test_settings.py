@@ -21,7 +21,7 @@ from sfm_shapefit.base.settings import (
 )
 from sfm_shapefit.facts.options import InspectOptions, LocateOptions, MapOptions, SourceOptions
 from sfm_shapefit.facts.placed import UNITS
-from sfm_shapefit.facts.tables import CameraRow, columns_of
+from sfm_shapefit.facts.tables import CameraRow, Table
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.placement.gauge import ScaleKind
 from sfm_shapefit.placement.options import GaugeOptions
@@ -273,8 +273,7 @@ def test_tables_are_columns_by_their_names_in_the_csv_with_nan_where_nothing_is_
     assert cameras["name"][0] == located.cameras[0].name
     assert cameras["placed"].dtype == np.bool_
     assert cameras["degree"].dtype == np.int64
-    unplaced = columns_of([CameraRow(name="a.jpg")], CameraRow, 2)
+    unplaced = Table(CameraRow, 2, {"name": ["a.jpg"]}).flat()
     assert list(unplaced)[4:6] == ["x", "y"]
-    assert np.isnan(
-        [unplaced["x"][0], unplaced["trust"][0], unplaced["piece"][0], unplaced["sigma_y"][0]]
-    ).all()
+    assert np.isnan([unplaced["x"][0], unplaced["trust"][0], unplaced["sigma_y"][0]]).all()
+    assert cameras["piece"].dtype == np.float64

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.estimate import BundleAdjustment, Estimate
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.facts.intrinsics import (
     CameraIntrinsics,
@@ -88,6 +88,7 @@ def estimate_of(freedom, sigmas, undetermined):
         focal_sigmas=np.array(sigmas),
         undetermined=np.array(undetermined),
         sensor_sigmas=np.full((len(sigmas), 2), np.nan),
+        solves=BundleAdjustment(converged=True, iterations=9, initial_error_px=2.0, final_error_px=1.0),
     )
 
 

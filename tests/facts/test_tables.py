@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sfm_shapefit.base.record import dumps, write_json
-from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, write_rows
 from tests.program import run, run_python
 from tests.scenes import RING
 
@@ -26,18 +26,20 @@ def lines_of(path):
 
 
 def test_a_row_has_one_cell_per_axis_and_empty_cells_for_what_is_not_known(tmp_path):
-    placed = CameraRow(
-        name='a,"b',
-        placed=True,
-        piece=0,
-        center=(0.1, -2.0, 1e-30),
-        degree=3,
-        trust=0.5,
-        sigma=(math.nan,) * 3,
-        correlation=(0.25, -1.0, 0.0),
-        turned_deg=1.5,
-    )
-    write_rows([placed, CameraRow(name="c", reason="why")], CameraRow, 3, tmp_path / "cameras.csv")
+    nan = math.nan
+    told = {
+        "name": ['a,"b', "c"],
+        "placed": [True, False],
+        "reason": ["", "why"],
+        "piece": [0, None],
+        "center": [(0.1, -2.0, 1e-30), (nan,) * 3],
+        "degree": [3, 0],
+        "trust": [0.5, nan],
+        "correlation": [(0.25, -1.0, 0.0), (nan,) * 3],
+        "turned_deg": [1.5, nan],
+    }
+    rows = Table(CameraRow, 3, told)
+    write_rows(rows, tmp_path / "cameras.csv")
     assert lines_of(tmp_path / "cameras.csv") == [
         ["name", "placed", "reason", "piece", "x", "y", "z", "degree", "trust", *SIGMAS, *RHOS, *TURNED],
         [
@@ -62,12 +64,18 @@ def test_a_row_has_one_cell_per_axis_and_empty_cells_for_what_is_not_known(tmp_p
         ],
         ["c", "false", "why", "", "", "", "", "0", *[""] * 10],
     ]
+    first, last = rows
+    assert first.center == rows[0].center == (0.1, -2.0, 1e-30)
+    assert (first.placed, first.piece, first.degree, first.sigma) == (True, 0, 3, ())
+    assert [row.name for row in rows[1:]] == [row.name for row in rows.taken([1])] == ["c"]
+    assert [row.name for row in rows.followed_by(rows)] == 2 * ['a,"b', "c"]
+    assert (last.name, last.placed, last.piece, last.center) == ("c", False, None, ())
 
 
 @pytest.mark.parametrize(("dimension", "axes"), [(2, ["vx", "vy"]), (4, ["vx1", "vx2", "vx3", "vx4"])])
 def test_a_pair_has_one_column_per_dimension(tmp_path, dimension, axes):
-    row = PairRow(name1="1", name2="2", direction=(0.5,) * dimension)
-    write_rows([row], PairRow, dimension, tmp_path / "pairs.csv")
+    told = {"name1": ["1"], "name2": ["2"], "direction": [(0.5,) * dimension]}
+    write_rows(Table(PairRow, dimension, told), tmp_path / "pairs.csv")
     header, cells = lines_of(tmp_path / "pairs.csv")
     assert header[2 : 2 + dimension] == axes
     assert cells[2 : 2 + dimension] == ["0.5"] * dimension
@@ -80,7 +88,7 @@ def test_bytes_that_are_no_utf8_come_back_from_the_json_and_are_escaped_in_a_tab
     assert (tmp_path / "out.json").read_bytes() == text.encode("utf-8") + b"\n"
     assert "é" in text
     assert os.fsencode(json.loads(text)["path"]) == b"mod\xe8le"
-    write_rows([CameraRow(name=NOT_UTF8)], CameraRow, 3, tmp_path / "cameras.csv")
+    write_rows(Table(CameraRow, 3, {"name": [NOT_UTF8]}), tmp_path / "cameras.csv")
     assert lines_of(tmp_path / "cameras.csv")[1][0] == r"mod\udce8le"
 
 

@@ -491,8 +491,8 @@ def test_adjustment_of_a_disturbed_seed_of_exact_data_finds_the_truth(source):
     aligned = fit_similarity_l1(centers, ring_centers()).apply(centers)
     # the solver stops when the cost falls by less than 1e-6 of itself; 0.18 units of disturbance before
     assert np.linalg.norm(aligned - ring_centers(), axis=1).max() < 1e-4
-    assert estimate.converged
-    assert adjusted.reconstruction.compute_mean_reprojection_error() < 0.01 < estimate.initial_error_px
+    assert estimate.solves.converged
+    assert adjusted.reconstruction.compute_mean_reprojection_error() < 0.01 < estimate.solves.initial_error_px
     assert adjusted.reconstruction.num_points3D() == len(points)
     assert adjusted.reconstruction.compute_num_observations() == len(points) * NUM_IMAGES
     for i, camera in original.cameras.items():

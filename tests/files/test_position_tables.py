@@ -106,7 +106,7 @@ def test_a_table_is_read_by_the_words_of_its_header(ring, tmp_path, program):
     geodetic = on_earth(ring)
     priors = table_priors(write(tmp_path / "t.csv", ring, map(cells, geodetic), header, separator), ring)
     assert_placed(priors, ring)
-    assert priors.datum[:2] == pytest.approx((47.3, 8.5), abs=1e-4)
+    assert priors.datum.geodetic[:2] == pytest.approx((47.3, 8.5), abs=1e-4)
     if program in WITH_ACCURACIES:
         np.testing.assert_allclose(priors.known.information, [np.linalg.inv(SIGMAS)] * len(ring.names))
     is_degrees_unsaid = program.startswith("no header") or program.endswith("x and y")
@@ -122,7 +122,7 @@ def test_the_southern_and_western_halves_have_signs_of_their_own(ring, tmp_path)
         header = "FileName,GPSLatitude,GPSLongitude,GPSAltitude,GPSLatitudeRef,GPSLongitudeRef"
         priors = table_priors(write(tmp_path / "t.csv", ring, map(row_of, geodetic), header), ring)
         assert_placed(priors, ring)
-        assert priors.datum[:2] == pytest.approx((-33.8, -70.6), abs=1e-4)
+        assert priors.datum.geodetic[:2] == pytest.approx((-33.8, -70.6), abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -234,7 +234,7 @@ def test_colmaps_pose_prior_json_is_read(ring, tmp_path):
     rows[0][1] = None
     path.write_text(json.dumps({**ENU, "schema": schema, "data": rows}))
     found = locate(MODEL, priors=path)
-    assert found.gauge.datum == (47.0, 8.0, 500.0)
+    assert found.gauge.datum.geodetic == (47.0, 8.0, 500.0)
     assert any("1 position is missing" in warning for warning in found.warnings)
     priors = table_priors(path, ring)
     np.testing.assert_allclose(priors.known.information, [np.linalg.inv(covariance)] * (len(ring.names) - 1))

@@ -29,7 +29,9 @@ def flights(centers, names=None):
     lens = Lens("SIMPLE_PINHOLE", (800.0, 500.0, 400.0), width=1000, height=800)
     images = Images.listed(names, (turns, centers), [0] * count, [lens])
     found = list(find_flights(images))
-    return sorted(k for one in found for k in one.cameras.tolist()), " ".join(one.what for one in found)
+    return sorted(names.index(name) for one in found for name in one.images), " ".join(
+        one.what for one in found
+    )
 
 
 def unit(rng):

@@ -10,16 +10,13 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import weigh_evidence
 from sfm_shapefit.judgement.graph_grade import judge_graph
-from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.reasons import Grade
-from sfm_shapefit.judgement.seams import Seam
-from sfm_shapefit.judgement.support import ObservationShares
-from sfm_shapefit.judgement.ties import Untied
-from sfm_shapefit.judgement.wrong_lenses import WrongLens
+from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.placement.second_configuration import Found, SecondConfiguration
+from tests.judgement.made import group_apart, place_of, untied_group, wrong_lens
 from tests.program import run
 from tests.scenes import BUNDLED
 
@@ -69,7 +66,9 @@ def test_doubtful_and_left_out_cameras_are_named_the_left_out_first(found):
 def test_what_contradicts_makes_a_model_bad_and_what_sees_no_point_decides_nothing(
     found, share, contradicting, grade
 ):
-    verdict = replace(found, observations=ObservationShares(share, contradicting)).verdict
+    verdict = replace(
+        found, observations=EvidenceShares(observations=share, contradicting=contradicting)
+    ).verdict
     assert verdict.grade is grade
     told = "51% of the observations contradict the cameras"
     assert verdict.reasons == (() if grade is Grade.GOOD else (told,))
@@ -150,29 +149,21 @@ def test_strict_ends_with_code_4_where_the_verdict_is_do_not_use_and_writes_the_
     run("place", BUNDLED / "graph40.txt", tmp_path / "sound", "--no-report", "--strict", code=0)
 
 
-def seam_of(cameras):
-    return Seam(np.array(cameras), 0, 9, 0, float("nan"))
-
-
-def place_of(camera):
-    return OtherPlace(camera, 5, 6, np.ones(3), np.zeros((5, 2), dtype=int))
-
-
 def test_evidence_that_the_fit_did_not_use_names_cameras_and_lowers_the_grade(found):
     names = found.images.names
-    verdict = replace(found, evidence=ModelEvidence(places=(place_of(3),))).verdict
+    verdict = replace(found, evidence=ModelEvidence(places=(place_of(names[3]),))).verdict
     assert (verdict.grade, verdict.cameras) == (Grade.LOOK, (names[3],))
 
-    lens = WrongLens(0, 1.2, 0.01, 8, 20.0)
+    lens = wrong_lens(found.placed.lenses[0])
     verdict = replace(found, evidence=ModelEvidence(lenses=(lens,))).verdict
     assert (verdict.grade, verdict.cameras) == (Grade.LOOK, ())  # a lens of all images names none of them
     assert verdict.reasons == ("images contradict 1 focal length",)
 
-    verdict = replace(found, evidence=ModelEvidence(seams=(seam_of([1, 2]),))).verdict
+    verdict = replace(found, evidence=ModelEvidence(seams=(group_apart(*names[1:3]),))).verdict
     assert (verdict.grade, verdict.cameras) == (Grade.DO_NOT_USE, (names[1], names[2]))
     assert verdict.reasons == ("2 of 8 cameras stand apart from the rest",)
     assert verdict.statement == "do not use: 2 of 8 cameras stand apart from the rest"
-    verdict = replace(found, evidence=ModelEvidence(seams=(seam_of([1, 2, 3]),))).verdict
+    verdict = replace(found, evidence=ModelEvidence(seams=(group_apart(*names[1:4]),))).verdict
     assert verdict.reasons == ("3 of 8 cameras stand apart from the rest",)  # and that is said once
 
 
@@ -182,15 +173,14 @@ def test_a_loose_group_stands_apart_and_an_unchecked_one_is_looked_at(found):
         (True, Grade.DO_NOT_USE, "nothing says how 2 of 8 cameras stand to the rest"),
         (False, Grade.LOOK, "nothing checks how groups of cameras stand to one another"),
     ):
-        group = Untied(np.array([1, 2]), 1, 2, 0, is_loose)
+        group = untied_group(*names[1:3], is_loose=is_loose)
         verdict = replace(found, evidence=ModelEvidence(untied=(group,))).verdict
         assert (verdict.grade, verdict.cameras, verdict.reasons) == (grade, (names[1], names[2]), (reason,))
     assert verdict.statement == f"look at 2 cameras ({names[1]}, {names[2]}); {reason}"
 
 
 def test_a_model_a_third_of_which_is_named_is_not_to_be_used_and_a_small_seam_is_looked_at(found):
-    few = ModelEvidence(places=(place_of(3), place_of(4)))
-    many = ModelEvidence(places=(place_of(2), place_of(3), place_of(4)))
+    few, many = (ModelEvidence(places=tuple(map(place_of, found.images.names[first:5]))) for first in (3, 2))
     assert replace(found, evidence=few).verdict.grade is Grade.LOOK
     verdict = replace(found, evidence=many).verdict
     assert verdict.grade is Grade.DO_NOT_USE

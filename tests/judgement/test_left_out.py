@@ -103,7 +103,7 @@ def test_a_wrong_lens_is_named_with_what_is_right(fisheye):
     scene = Scene(factors=[1.0, 1.0, 1.0, 1.2], fisheye=fisheye)
     found = scene.left_out()
     (wrong,) = wrong_lenses(found, scene.images)
-    assert (wrong.lens, wrong.num_images) == (3, 1)
+    assert (wrong.camera, wrong.num_images) == (3, 1)
     assert wrong.factor == pytest.approx(1.2, abs=0.015)
     assert abs(np.log(wrong.factor / 1.2)) < 4.0 * wrong.sigma
     assert wrong.sigma < 0.01
@@ -112,9 +112,9 @@ def test_a_wrong_lens_is_named_with_what_is_right(fisheye):
 def test_the_rays_of_a_wrong_lens_make_no_right_one_look_wrong():
     scene = Scene(noise_px=0.1, factors=[1.3, 1.0, 0.8])
     once = wrong_lenses(scene.left_out(), scene.images)
-    assert {0, 2} <= {wrong.lens for wrong in once}
+    assert {0, 2} <= {wrong.camera for wrong in once}
     left_out, wrong = question_lenses(scene.points, scene.images, scene)
-    assert {item.lens: round(item.factor, 2) for item in wrong} == {0: 1.3, 2: 0.8}
+    assert {item.camera: round(item.factor, 2) for item in wrong} == {0: 1.3, 2: 0.8}
     right = np.setdiff1d(np.arange(NUM_IMAGES), [0, 2])
     assert np.abs(left_out.log_factors[right]).max() < 0.003
 
@@ -136,7 +136,7 @@ def test_an_image_that_makes_no_points_is_asked_if_its_pixels_fit(noisy):
     assert seen.count_seen(NUM_IMAGES).tolist() == [points.num_points] * NUM_IMAGES
     assert (seen.keypoints == seen.points_seen()).all()  # each image numbers them as they are
     _, wrong = question_lenses(seen, scene.images, scene, among=among)
-    assert [item.lens for item in wrong] == ([] if noisy else [3])
+    assert [item.camera for item in wrong] == ([] if noisy else [3])
     assert noisy or wrong[0].factor == pytest.approx(1.2, abs=0.015)
 
 
@@ -172,7 +172,7 @@ def test_five_deviations_do_where_no_other_image_is_near_them(others, num_others
     left_out = LeftOut(np.full(NUM_IMAGES, 100), changes, sigmas, free, np.ones(NUM_IMAGES))
     alike = Scene().images
     unlike = alike.with_lenses([replace(alike.lenses[0], width=2), *alike.lenses[1:]])
-    assert [one.lens for one in wrong_lenses(left_out, unlike)] == [0] * is_named
+    assert [one.camera for one in wrong_lenses(left_out, unlike)] == [0] * is_named
     assert wrong_lenses(left_out, alike) == ()  # the others, of the same size, have no such focal length
 
 
@@ -181,7 +181,7 @@ def test_a_lens_of_all_images_is_wrong_if_they_ask_for_unlike_ones():
     assert wrong_lenses(right.left_out(), right.images) == ()
     unlike = Scene(shared=True, factors=np.tile([0.95, 1.05], NUM_IMAGES // 2))
     _, (wrong,) = question_lenses(unlike.points, unlike.images, unlike)
-    assert (wrong.lens, wrong.num_images) == (0, NUM_IMAGES)
+    assert (wrong.camera, wrong.num_images) == (0, NUM_IMAGES)
     assert wrong.factor == pytest.approx(1.0, abs=0.02)
     assert 0.02 < wrong.sigma < 0.1
 

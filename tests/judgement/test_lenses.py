@@ -110,10 +110,10 @@ def test_lenses_of_one_device_are_alike(scatter):
     assert bool(found) == (scatter > 0.1)
     for one in found:
         off = np.abs(np.log(focals / np.median(focals)))
-        assert one.cameras.tolist() == np.flatnonzero(off > 0.1).tolist()
-        assert (
-            f"{focals[one.cameras].min():.2f} to {focals[one.cameras].max():.2f} picture widths" in one.what
-        )
+        assert one.images == tuple(f"frame{k:03}.jpg" for k in np.flatnonzero(off > 0.1))
+        unlike = focals[off > 0.1]
+        assert f"{unlike.min():.2f} to {unlike.max():.2f} picture widths" in one.what
+        assert [f"{focal:.2f} picture widths" in own for focal, own in zip(unlike, one.of_each, strict=True)]
         assert not one.cannot_be
 
 

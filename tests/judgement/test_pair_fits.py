@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.judgement.evidence import fit_pairs
+from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.judgement.seams import find_cuts
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.scene.images import Frames
@@ -123,7 +123,8 @@ def test_a_shifted_group_is_cut_and_a_moved_camera_has_its_other_place(centers):
     assert cut.cameras.tolist() == GROUP.tolist()
     moved = centers.copy()
     moved[5] += [0.0, 3.0, 0.0]
-    (place,) = [place for place in fit_pairs(moved, measured(centers)).other_places() if place.camera == 5]
+    places = fit_pairs(moved, measured(centers)).other_places([str(k) for k in range(N)])
+    (place,) = [place for place in places if place.image == "5"]
     assert place.offset == pytest.approx([0.0, -3.0, 0.0], abs=1e-6)
     assert (place.num_here, place.num_there) == (0, N - 1)
 
@@ -135,14 +136,17 @@ def test_a_camera_is_asked_if_more_of_its_pairs_contradict_it_than_is_usual(cent
         fits = fit_pairs(centers, measured(centers, off_deg=np.where(wrong, 30.0, 0.0)))
         return fits.contradicted(own)
 
+    def name(row):
+        return each_alone(centers).names[row]
+
     each = list(range(N))
     of_first = (EVERY == 0).any(axis=1)
-    assert contradicted(of_first & (EVERY[:, 1] <= (N - 1) // 3), each) == ()
-    assert contradicted(of_first & (EVERY[:, 1] <= 6), each) == ((0, N - 1, 6),)
+    assert contradicted(of_first & (EVERY[:, 1] <= (N - 1) // 3), each) == {}
+    assert contradicted(of_first & (EVERY[:, 1] <= 6), each) == {name(0): (N - 1, 6)}
     everywhere = EVERY.sum(axis=1) % 4 == 0  # a fourth of all
-    assert contradicted(everywhere | (of_first & (EVERY[:, 1] <= 4)), each) == ()
-    assert [one.camera for one in contradicted(everywhere | (of_first & (EVERY[:, 1] <= 12)), each)] == [0]
+    assert contradicted(everywhere | (of_first & (EVERY[:, 1] <= 4)), each) == {}
+    assert [*contradicted(everywhere | (of_first & (EVERY[:, 1] <= 12)), each)] == [name(0)]
     with_last = [*each[:-1], 0]  # of one frame, whose pairs count together; those inside do not
-    assert contradicted(of_first & (EVERY[:, 1] <= 6), with_last) == ()
+    assert contradicted(of_first & (EVERY[:, 1] <= 6), with_last) == {}
     both = contradicted(of_first & (EVERY[:, 1] <= 12), with_last)
-    assert both == ((0, 2 * (N - 2), 12), (N - 1, 2 * (N - 2), 12))
+    assert both == {name(0): (2 * (N - 2), 12), name(N - 1): (2 * (N - 2), 12)}

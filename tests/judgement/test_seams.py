@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.seams import find_cuts, find_seams
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Lens
 from tests.problems import made_rotations
 
 N, GROUP = 18, np.array([0, 3, 8, 11, 14, 17])
@@ -52,6 +54,12 @@ def rotations():
     return Rotation.random(N, random_state=0).as_matrix()
 
 
+def turned_to(rotations):
+    """Images 0, 1, ... with some rotations."""
+    lens = Lens("SIMPLE_PINHOLE", (800.0, 500.0, 400.0), width=1000, height=800)
+    return Images.listed([str(k) for k in range(N)], (rotations, np.zeros((N, 3))), [0] * N, [lens])
+
+
 def test_what_agrees_has_no_cut_and_nor_have_wrong_pairs_at_random():
     assert cut_of(EVERY, EVERY[:0]) == ()
     wrong = np.random.default_rng(0).random(len(EVERY)) < 0.3
@@ -62,8 +70,8 @@ def test_a_group_that_nothing_ties_is_a_seam_whatever_rotations_say(rotations):
     (cut,) = cut_of(*split())
     assert cut.cameras.tolist() == GROUP.tolist()
     assert (cut.num_agreeing, len(cut.contradicting), cut.is_tied) == (0, 72, False)
-    (seam,) = find_seams((cut,), rotations_of(EVERY[:0], rotations), rotations)
-    assert seam.cameras.tolist() == GROUP.tolist()
+    (seam,) = find_seams((cut,), rotations_of(EVERY[:0], rotations), turned_to(rotations))
+    assert seam.images == tuple(map(str, GROUP))
     assert (seam.num_agreeing, seam.num_contradicting, seam.num_turned) == (0, 72, 0)
 
 
@@ -71,14 +79,15 @@ def test_a_tied_group_is_a_seam_if_contradictions_agree_on_one_turn(rotations):
     (cut,) = cut_of(*split(12))
     assert (cut.num_agreeing, len(cut.contradicting), cut.is_tied) == (12, 60, True)
     turn = Rotation.from_rotvec([0.0, 0.0, np.radians(90.0)]).as_matrix()
-    (seam,) = find_seams((cut,), rotations_of(EVERY, rotations, turn), rotations)
+    images = turned_to(rotations)
+    (seam,) = find_seams((cut,), rotations_of(EVERY, rotations, turn), images)
     assert (seam.num_turned, round(seam.turn_deg, 6)) == (60, 90.0)
     random = rotations_of(EVERY, rotations, at_random=True)
-    assert find_seams((cut,), random, rotations) == ()
+    assert find_seams((cut,), random, images) == ()
     few = random.rotations.copy()
     rows = np.flatnonzero([pair in cut.contradicting.tolist() for pair in EVERY.tolist()])[:6]
     few[rows] = rotations_of(EVERY, rotations, turn).rotations[rows]
-    assert find_seams((cut,), replace(random, rotations=few), rotations) == ()  # 6 of 60 are chance
+    assert find_seams((cut,), replace(random, rotations=few), images) == ()  # 6 of 60 are chance
 
 
 def test_a_group_without_a_turn_is_a_seam_if_it_is_tied_to_nothing_that_most_of_the_rest_is_in(rotations):
@@ -88,7 +97,7 @@ def test_a_group_without_a_turn_is_a_seam_if_it_is_tied_to_nothing_that_most_of_
         tied = np.where(np.isin(np.arange(N), few), 0, group)
         cuts = find_cuts(agreeing, contradicting, tied)
         assert [cut.is_tied for cut in cuts] == [not found]
-        assert len(find_seams(cuts, rotations_of(EVERY, rotations), rotations)) == found
+        assert len(find_seams(cuts, rotations_of(EVERY, rotations), turned_to(rotations))) == found
 
 
 def test_a_group_is_cut_off_only_by_twice_as_many_contradictions_as_agree():

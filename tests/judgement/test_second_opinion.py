@@ -7,13 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.judgement.evidence import Contradicted, ModelEvidence, SecondOpinion, fit_pairs
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import weigh_evidence
-from sfm_shapefit.judgement.places import OtherPlace
+from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.judgement.reasons import Grade
-from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.second_opinion import compare_models
-from sfm_shapefit.judgement.ties import Untied
+from tests.judgement.made import group_apart, opinion_with, place_of, untied_group
 from tests.judgement.test_pair_fits import measured
 from tests.judgement.test_seams import GROUP, N
 from tests.scenes import COURTYARD
@@ -35,6 +34,10 @@ def moved(images, rows, *, shift=0.0, scale=1.0, turn_deg=0.0):
     return replace(images, frames=replace(frames, centers=centers, rotations=rotations))
 
 
+def rows_of(images, names):
+    return sorted(map(images.names.index, names))
+
+
 def in_other_axes(images):
     turn = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()
     frames = images.frames
@@ -53,10 +56,10 @@ def compare(images, others, truth, doubted=()):
 @pytest.mark.parametrize("how", [{"shift": 2.0}, {"scale": 1.1}, {"turn_deg": 3.0}, {"turn_deg": 90.0}])
 def test_a_group_that_is_wrong_as_a_whole_is_named_by_a_model_that_has_it_right(images, how):
     found = compare(moved(images, GROUP, **how), images, images)
-    assert set(found.wrong.tolist()) <= set(GROUP.tolist())
+    assert set(rows_of(images, found.wrong)) <= set(GROUP.tolist())
     assert len(found.wrong) >= len(GROUP) - ("scale" in how)  # one may be near the middle, which stays
     assert found.num_against > 10 * max(found.num_for, 1)
-    assert set(found.confirmed.tolist()) >= set(range(N)) - set(GROUP.tolist())
+    assert set(rows_of(images, found.confirmed)) >= set(range(N)) - set(GROUP.tolist())
     assert found.usual < 1e-6
 
 
@@ -84,50 +87,55 @@ def test_a_model_that_differs_as_a_whole_confirms_nobody(images, bent, num_confi
 
 def test_a_camera_that_the_other_model_doubts_is_not_confirmed_by_it(images):
     found = compare(moved(images, [5], shift=2.0), images, images, doubted=[5, 7])
-    assert found.ambiguous.tolist() == [7]  # 5 stands elsewhere, where pairs support it
-    assert found.wrong.tolist() == [5]
-    assert sorted([*found.confirmed.tolist(), 5, 7]) == list(range(N))
+    assert rows_of(images, found.ambiguous) == [7]  # 5 stands elsewhere, where pairs support it
+    assert rows_of(images, found.wrong) == [5]
+    assert sorted([*rows_of(images, found.confirmed), 5, 7]) == list(range(N))
 
 
 @pytest.mark.parametrize(("wrong", "apart"), [([5], False), ([5, 6], True)])
 def test_a_single_camera_elsewhere_is_no_group_that_stands_apart(images, wrong, apart):
     second = compare(moved(images, wrong, shift=2.0), images, images)
-    assert second.wrong.tolist() == wrong
+    assert rows_of(images, second.wrong) == wrong
     said = [one.sentence for one in weigh_evidence(ModelEvidence(second=second), images)]
     assert any("stand apart from the rest" in sentence for sentence in said) == apart
 
 
 def test_what_it_clears_is_not_told(images):
     """Of groups on both sides of a seam the wrong one is; who stands alike in both has one place."""
-    place = OtherPlace(5, 2, 3, np.ones(3), np.zeros((2, 2), dtype=int))
+
+    def named(*rows):
+        return tuple(images.names[k] for k in rows)
+
     evidence = ModelEvidence(
-        places=(place, place._replace(camera=7)),
-        contradicted=(Contradicted(5, 9, 5), Contradicted(7, 9, 5)),
-        seams=tuple(Seam(np.array(rows), 1, 9, 0, np.nan) for rows in ([5, 6], [8, 9], [0, 7])),
-        untied=tuple(Untied(np.array(rows), 1, 9, 0, is_loose=True) for rows in ([5, 6], [8, 9])),
+        places=tuple(map(place_of, named(5, 7))),
+        contradicted=named(5, 7),
+        contradictions=dict.fromkeys(named(5, 7), (9, 5)),
+        seams=tuple(group_apart(*named(*rows)) for rows in ([5, 6], [8, 9], [0, 7])),
+        untied=tuple(untied_group(*named(*rows)) for rows in ([5, 6], [8, 9])),
     )
-    contradicting = np.array([(5, 8), (6, 8), (5, 9), (4, 8), (0, 1), (2, 7), (0, 5), (6, 7)])
+    contradicting = [
+        named(*pair) for pair in ((5, 8), (6, 8), (5, 9), (4, 8), (0, 1), (2, 7), (0, 5), (6, 7))
+    ]
     second = compare(moved(images, [5, 6], shift=2.0), images, images, doubted=[0, 8, 9])
     both = evidence.beside(second, contradicting)
-    assert [one.camera for one in both.places] == [one.camera for one in both.contradicted] == [5]
+    assert tuple(one.image for one in both.places) == both.contradicted == named(5)
     # Only half of the pairs that contradict 0 and 7 are with what is wrong.
-    assert [group.cameras.tolist() for group in (*both.seams, *both.untied)] == [[5, 6], [0, 7], [5, 6]]
+    assert both.apart == [named(5, 6), named(0, 7), named(5, 6)]
     reasons = list(weigh_evidence(both, images))
-    named = {name for one in reasons for name in one.images}
-    assert named == {images.names[k] for k in (0, 5, 6, 7, 8, 9)}  # three are doubted there
+    assert {name for one in reasons for name in one.images} == {
+        *named(0, 5, 6, 7, 8, 9)
+    }  # three are doubted there
     assert f"4 of {N} cameras stand apart from the rest" in [one.sentence for one in reasons]
-    good = evidence.beside(second._replace(grade=Grade.GOOD), contradicting)
-    assert [group.cameras.tolist() for group in good.seams] == [
-        [5, 6]
-    ]  # who stands as in a good model is right
-    neither = evidence.beside(second._replace(wrong=second.wrong[:0]), contradicting)
+    good = evidence.beside(replace(second, grade=Grade.GOOD), contradicting)
+    assert [one.images for one in good.seams] == [named(5, 6)]  # who stands as in a good model is right
+    neither = evidence.beside(replace(second, wrong=()), contradicting)
     assert (neither.seams, neither.untied) == (evidence.seams, evidence.untied)
 
 
 def test_where_pairs_support_neither_nobody_is_believed(images):
     one, other = moved(images, [5], shift=2.0), moved(images, [5], shift=-2.0)
     found = compare(one, other, images)
-    assert found.wrong.tolist() == []
+    assert found.wrong == ()
     half = measured(images.centers)
     pairs = half.pairs
     towards = np.where((np.arange(len(pairs)) % 2 == 0)[:, None], one.centers[5], other.centers[5])
@@ -136,7 +144,7 @@ def test_where_pairs_support_neither_nobody_is_believed(images):
     half = replace(half, directions=lies / np.linalg.norm(lies, axis=1, keepdims=True))
     nobody = np.zeros(N, dtype=np.bool_)
     found = compare_models(one, fit_pairs(one.centers, half), other, fit_pairs(other.centers, half), nobody)
-    assert found.undecided.tolist() == [5]
+    assert rows_of(images, found.undecided) == [5]
 
 
 def test_without_cameras_in_common_there_is_no_opinion(images):
@@ -146,9 +154,8 @@ def test_without_cameras_in_common_there_is_no_opinion(images):
 
 def test_of_a_group_those_are_named_whom_the_second_opinion_names(images):
     """Pairs support neither of two places of 5 and 6; 4 stands alike in both."""
-    none = np.zeros(0, dtype=np.int64)
-    alike = np.setdiff1d(np.arange(N), [5, 6])
-    second = SecondOpinion(N, 0.001, none, np.array([5, 6]), alike, 0, 0, none)
-    evidence = ModelEvidence(seams=(Seam(np.array([4, 5, 6]), 1, 9, 0, np.nan),), second=second)
-    named = {name for one in weigh_evidence(evidence, images) for name in one.images}
-    assert named == {images.names[k] for k in (5, 6)}
+    unlike, group = ([images.names[k] for k in rows] for rows in ([5, 6], [4, 5, 6]))
+    confirmed = frozenset(images.names) - {*unlike}
+    second = opinion_with(undecided=tuple(unlike), confirmed=confirmed)
+    evidence = ModelEvidence(seams=(group_apart(*group),), second=second)
+    assert {name for one in weigh_evidence(evidence, images) for name in one.images} == {*unlike}

@@ -66,7 +66,7 @@ def arrays_of(found):
 def test_observations_of_right_cameras_agree(found):
     shares = shares_at(*arrays_of(found))
     assert shares == found.observations
-    assert shares.agreeing > 0.9
+    assert shares.observations > 0.9
     assert shares.contradicting < 0.01
     assert shares_at(*arrays_of(found), apart=np.array([[1, 0], [2, 3]])) == shares
 
@@ -95,7 +95,7 @@ def test_observations_without_a_point_contradict_only_cameras_that_are_wrong(fou
     images, points = arrays_of(found)
     none = points.taken(np.zeros(len(points.images), dtype=bool))
     bare = shares_at(images, none)
-    assert bare.agreeing == 0.0
+    assert bare.observations == 0.0
     assert bare.contradicting < 0.05
 
     frames = images.frames

@@ -27,13 +27,17 @@ def halves():
     ]
 
 
+def names_of(inside):
+    return tuple(map(str, np.flatnonzero(inside).tolist()))
+
+
 def found(*crossing, agreeing=(), contradicting=(), known=(), inside=None, misses=(), **more):
     """The groups of two halves that points, and pairs, cross."""
     points = halves() if inside is None else inside
     rays = rays_of(*points, *crossing, misses=[len(points) + k for k in misses], **more)
     sides = (np.array(side, dtype=int).reshape(-1, 2) for side in (agreeing, contradicting))
     group = rigid_groups(N, rays, np.array(known, dtype=int).reshape(-1, 2))
-    return find_groups(group, rays, links_of_pairs(*sides))
+    return find_groups(group, rays, links_of_pairs(*sides), names_of)
 
 
 FROM_BOTH = (0, 1, 7, 8)
@@ -44,8 +48,8 @@ def test_halves_that_nothing_crosses_are_two_groups_of_which_the_further_one_is_
     group, (half,) = found()
     assert len(set(group[:HALF])) == len(set(group[HALF:])) == 1
     assert group[0] != group[HALF]
-    assert half.cameras.tolist() == list(range(HALF, N))
-    assert half[1:] == (0, 0, 0, True)
+    assert half.images == tuple(map(str, range(HALF, N)))
+    assert (half.num_agreeing, half.num_contradicting, half.num_points, half.is_loose) == (0, 0, 0, True)
 
 
 @pytest.mark.parametrize(("count", "misses", "ties"), [(15, 7, True), (14, 0, False), (15, 8, False)])
@@ -68,12 +72,12 @@ def test_two_cameras_alone_are_no_group():
     inside += [tuple(8 + one for one in seen) for seen in inside]
     between = [(6, 7, other) for other in (0, 0, 1, 1, 2, 2, 3, 3, 8, 8, 9, 9, 10, 10, 11)]
     _, groups = found(*between, inside=inside)
-    assert [group.cameras.tolist() for group in groups] == [[8, 9, 10, 11]]
+    assert [group.images for group in groups] == [("8", "9", "10", "11")]
 
 
 def test_points_that_one_camera_sees_of_the_other_half_say_where_that_stands_but_not_how_large_the_half_is():
     _, (half,) = found(*[(0, 7, 8)] * 100)
-    assert set(half.cameras.tolist()) - {0} in ({*range(1, HALF)}, {*range(HALF, N)})
+    assert {*map(int, half.images)} - {0} in ({*range(1, HALF)}, {*range(HALF, N)})
     assert half.is_loose
     tied, groups = found(*[(0, 7, 8)] * 100, *[(1, 7, 8)] * 15)
     assert (len(set(tied)), groups) == (1, ())
@@ -138,5 +142,5 @@ def test_points_are_counted_some_at_a_time_with_the_same_groups(monkeypatch):
 def test_nothing_links_nothing():
     none = Rays(np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0, dtype=bool))
     links = NodeLinks(np.zeros(0, dtype=int), np.zeros((0, 2), dtype=int), np.zeros(0, dtype=bool))
-    group, groups = find_groups(rigid_groups(3, none, np.zeros((0, 2), dtype=int)), none, links)
+    group, groups = find_groups(rigid_groups(3, none, np.zeros((0, 2), dtype=int)), none, links, names_of)
     assert (group.tolist(), groups) == ([0, 1, 2], ())

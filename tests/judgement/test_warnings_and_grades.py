@@ -9,40 +9,33 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.warnings import match_warnings, quality_warnings, support_warnings, trust_warnings
-from sfm_shapefit.judgement.evidence import Contradicted, ModelEvidence, SecondOpinion
-from sfm_shapefit.judgement.places import OtherPlace
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each
-from sfm_shapefit.judgement.seams import Seam
-from sfm_shapefit.judgement.ties import Untied
-from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.placement.second_configuration import Found, SecondConfiguration
+from tests.judgement.made import group_apart, opinion_with, place_of, untied_group, wrong_lens
 
 PACKAGE = Path(sfm_shapefit.__file__).parent
 ADVICE = re.compile("trust it|without a look|do not use|can(not)? be used|is sound|is good", re.IGNORECASE)
 SPEAKERS = {"judgement/reasons.py", "report/first_screen.py"}
 """What says what a model is worth."""
-NONE = np.zeros(0, dtype=np.int64)
-SECOND = SecondOpinion(8, 0.01, NONE, NONE, NONE, 0, 3, NONE)
 
 
-def place(camera):
-    return OtherPlace(camera, 5, 6, np.ones(3), np.zeros((5, 2), dtype=int))
-
-
-EVIDENCE = {
-    "lenses": ModelEvidence(lenses=(WrongLens(0, 1.2, 0.01, 8, 20.0),)),
-    "places": ModelEvidence(places=(place(3),)),
-    "seams": ModelEvidence(seams=(Seam(np.array([1, 2]), 0, 9, 0, float("nan")),)),
-    "loose": ModelEvidence(untied=(Untied(np.array([1, 2]), 1, 2, 0, is_loose=True),)),
-    "untied": ModelEvidence(untied=(Untied(np.array([1, 2]), 1, 2, 0, is_loose=False),)),
-    "contradicted": ModelEvidence(contradicted=(Contradicted(2, 9, 5),)),
-    "wrong by a second opinion": ModelEvidence(second=SECOND._replace(wrong=np.array([2]))),
-    "undecided": ModelEvidence(second=SECOND._replace(undecided=np.array([2, 4]))),
-    "ambiguous": ModelEvidence(second=SECOND._replace(ambiguous=np.array([2]))),
-}
+def evidence_against(images):
+    """Evidence of each kind against a model, by what it is about."""
+    one, two, three, four = images.names[1:5]
+    return {
+        "lenses": ModelEvidence(lenses=(wrong_lens(images.lenses[0]),)),
+        "places": ModelEvidence(places=(place_of(three),)),
+        "seams": ModelEvidence(seams=(group_apart(one, two),)),
+        "loose": ModelEvidence(untied=(untied_group(one, two),)),
+        "untied": ModelEvidence(untied=(untied_group(one, two, is_loose=False),)),
+        "contradicted": ModelEvidence(contradicted=(two,), contradictions={two: (9, 5)}),
+        "wrong by a second opinion": ModelEvidence(second=opinion_with(wrong=(two,))),
+        "undecided": ModelEvidence(second=opinion_with(undecided=(two, four))),
+        "ambiguous": ModelEvidence(second=opinion_with(ambiguous=(two,))),
+    }
 
 
 def uncertain(found):
@@ -88,13 +81,13 @@ def test_a_warning_that_doubts_a_model_stands_over_no_good_one(ring_located, dou
     assert told.verdict.grade is not Grade.GOOD
 
 
-@pytest.mark.parametrize("name", EVIDENCE)
-def test_evidence_that_is_told_is_in_the_verdict_and_each_named_camera_has_its_reason(ring_located, name):
-    assert tell_evidence(EVIDENCE[name], ring_located.placed).statements
-    verdict = replace(ring_located, evidence=EVIDENCE[name]).verdict
-    assert verdict.grade is not Grade.GOOD
-    assert {image for one in verdict.findings for image in one.images} == set(verdict.cameras)
-    assert all(one.sentence for one in verdict.findings)
+def test_evidence_that_is_told_is_in_the_verdict_and_each_named_camera_has_its_reason(ring_located):
+    for name, evidence in evidence_against(ring_located.placed).items():
+        assert evidence.statements, name
+        verdict = replace(ring_located, evidence=evidence).verdict
+        assert verdict.grade is not Grade.GOOD, name
+        assert {image for one in verdict.findings for image in one.images} == set(verdict.cameras)
+        assert all(one.sentence for one in verdict.findings)
 
 
 def test_what_stands_beside_any_grade_says_nothing_of_it(ring_located):

@@ -15,7 +15,7 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
-from sfm_shapefit.judgement.support import ObservationShares, Support
+from sfm_shapefit.judgement.support import EvidenceShares, Support
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, choose_inputs, open_source
 from sfm_shapefit.pipeline.state import ModelState
@@ -95,7 +95,7 @@ def delivered(source) -> ModelState:
         kept=~nobody,
         images=model.images,
         points=points_of(model.arrays, model.images),
-        support=Support(np.full(8, -1), nobody, ObservationShares(1.0, 0.0)),
+        support=Support(np.full(8, -1), nobody, EvidenceShares(observations=1.0, contradicting=0.0)),
         gauge=state.frame,
         evidence=ModelEvidence(),
     )

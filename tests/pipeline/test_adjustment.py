@@ -81,8 +81,8 @@ def test_rotations_that_are_off_are_weighted_by_about_how_much_and_end_nearer_to
 
 def test_bundle_adjustment_obeys_the_same_choice(placed):
     found = sfm_shapefit.locate(COURTYARD / "sparse" / "0", adjust="full")
-    assert found.adjusted.converged
-    assert found.adjusted.final_error_px < found.adjusted.initial_error_px
+    assert found.adjusted.solves.converged
+    assert found.adjusted.solves.final_error_px < found.adjusted.solves.initial_error_px
     assert error(found).position.mean < error(placed).position.mean
     assert error(found).rotation_deg.max < 1e-5  # exact ones, which free ones leave
 

@@ -9,16 +9,16 @@ import pytest
 
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import points_of
-from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import weigh_evidence
 from sfm_shapefit.judgement.image_quality import image_quality
-from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.map import map_database
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from tests.facts.test_schema import problems
+from tests.judgement.made import opinion_with, place_of
 from tests.program import run, run_refused
 from tests.scenes import COURTYARD, PHOTOGRAPHED, RING, fingerprint
 from tests.structures import pictures_of
@@ -121,7 +121,7 @@ def test_what_map_doubts_check_does_not_call_good():
         assert " workspace " in found.facts.next_step.command  # it would be placed there again
         assert banner(found.drawing, found.facts)["sentence"].startswith("0004.jpg, 0005.jpg may be wrong")
         evidence = found.facts.evidence
-        unlike = replace(evidence, second=replace(evidence.second, has_nothing_in_common=True))
+        unlike = replace(evidence, second=replace(evidence.second, usual=0.2, ambiguous=()))
         assert " workspace " not in replace(found.facts, evidence=unlike).next_step.command
 
 
@@ -137,8 +137,8 @@ def test_a_weak_camera_that_stands_where_another_model_has_it_is_not_named(tmp_p
 
 def test_a_camera_that_has_two_places_in_the_other_model_is_not_confirmed(courtyard_mapped):
     located = courtyard_mapped.models[0]
-    place = OtherPlace(4, 3, 5, np.ones(3), np.zeros((3, 2), dtype=int))
-    doubtful = replace(located, evidence=ModelEvidence(places=(place,)))
+    places = (place_of(located.placed.names[4], 3, 5),)
+    doubtful = replace(located, evidence=ModelEvidence(places=places))
     other = replace(courtyard_mapped, models=(doubtful,))
     found = check(COURTYARD / "truth", COURTYARD / "database.db", second_opinion=other)
     assert found.facts.evidence.second.ambiguous == found.verdict.cameras == (located.placed.names[4],)
@@ -214,12 +214,10 @@ def test_a_database_that_lacks_an_image_of_the_model_is_doubted(tmp_path):
 
 def test_a_second_opinion_of_another_shape_is_a_reason_to_look(tmp_path):
     """What nothing but the model's own points and a third of the pairs speak for."""
-    none, usual = np.zeros(0, dtype=np.int64), {"num_common": 8, "num_for": 0, "num_against": 0}
-    rows = {"wrong": none, "undecided": none, "confirmed": none, "ambiguous": none}
     images = read_model(RING / "sparse/0").images
     told = "the model that map makes of the same matches has another shape"
     for share, said in ((0.05, []), (0.4, [told])):
-        evidence = ModelEvidence(second=SecondOpinion(usual=share, **usual, **rows))
+        evidence = ModelEvidence(second=opinion_with(usual=share))
         assert [one.sentence for one in weigh_evidence(evidence, images)] == said
 
 

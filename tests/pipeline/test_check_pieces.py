@@ -63,7 +63,7 @@ def test_lenses_that_cannot_be_are_named_and_many_of_them_forbid_the_use(num):
 def test_locate_says_the_same_of_lenses_as_check():
     found = sfm_shapefit.locate(with_own_lenses(range(2)))
     assert found.verdict.grade is Grade.DO_NOT_USE
-    assert [one.cannot_be for one in found.told_evidence.odd] == [True]
+    assert [one.cannot_be for one in found.evidence.odd] == [True]
 
 
 def test_a_camera_that_flies_off_is_named_with_how_far():

@@ -9,8 +9,9 @@ from scipy.spatial import cKDTree
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import points_of
-from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion, fit_pairs
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.image_quality import find_weak_images
+from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.judgement.reasons import Grade, Kind, of_each
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.pictures import points_of_pictures
@@ -24,6 +25,7 @@ from sfm_shapefit.pipeline.referee import (
     grade_model,
     read_structure,
 )
+from tests.judgement.made import opinion_with
 from tests.pipeline.made import FOLDER, directions_of, opened
 
 MODEL = read_model(FOLDER)
@@ -42,13 +44,6 @@ def state_of(source, **found):
     state = CheckState(model=MODEL, source=source, options=DirectionOptions(), evidence=ModelEvidence())
     state = replace(state, fits=fit_pairs(TRUTH.centers, directions_of(TRUTH)))
     return replace(read_structure(state, Clock()), **found)
-
-
-def second_opinion(**rows):
-    none = np.zeros(0, dtype=np.int64)
-    numbers = {"num_common": 8, "usual": 0.0, "num_for": 0, "num_against": 0}
-    named = dict.fromkeys(("wrong", "undecided", "confirmed", "ambiguous"), none)
-    return SecondOpinion(**(numbers | named | rows))
 
 
 def test_structure_has_the_models_points_and_names_images_that_few_of_them_hold_or_that_they_miss():
@@ -93,7 +88,7 @@ def test_evidence_names_the_camera_that_pairs_put_elsewhere():
     with opened() as source:
         fits = fit_pairs(moved(2), directions_of(TRUTH, source.view.pairs))
         evidence = gather_evidence_against(state_of(source, fits=fits), Clock()).evidence
-    assert {*(one.camera for one in evidence.places), *(one.camera for one in evidence.contradicted)} == {2}
+    assert {*(one.image for one in evidence.places), *evidence.contradicted} == {TRUTH.names[2]}
     assert evidence.seams == ()
 
 
@@ -113,7 +108,7 @@ def test_a_single_camera_that_another_model_has_elsewhere_counts_unless_the_pixe
         other = OtherModel(others, fits, np.zeros(8, dtype=np.bool_), ring_mapped, 0)
         second = compare_with_other(replace(state, other=other)).evidence.second
         assert compare_with_other(state) is state
-    assert [*second.wrong, *second.undecided] == ([] if confirmed else [2])
+    assert [*second.wrong, *second.undecided] == ([] if confirmed else [TRUTH.names[2]])
     assert second.folder == "0"
 
 
@@ -122,7 +117,7 @@ def test_a_weak_image_that_stands_where_another_model_has_it_is_not_named():
     with opened() as source:
         state = state_of(source, weak=weak)
         assert set(grade_model(state, Clock()).verdict.cameras) == set(TRUTH.names)
-        evidence = ModelEvidence(second=second_opinion(confirmed=np.arange(8)))
+        evidence = ModelEvidence(second=opinion_with(confirmed=frozenset(TRUTH.names)))
         confirmed = grade_model(replace(state, evidence=evidence), Clock())
     assert confirmed.verdict.cameras == ()
     assert confirmed.verdict.grade is Grade.GOOD

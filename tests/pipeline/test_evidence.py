@@ -49,7 +49,7 @@ def test_a_wrong_lens_that_is_held_is_named_with_the_right_focal_length():
     name = truth.image(wrong_id).name
     model = with_own_lenses(truth, {name: 1.1})
     found = sfm_shapefit.locate(model, RING / "database.db", intrinsics="held")
-    (told,) = found.told_evidence.lenses
+    (told,) = found.evidence.lenses
     right_px = truth.image(wrong_id).camera.mean_focal_length()
     assert told.camera == wrong_id
     assert told.focal_px == pytest.approx(1.1 * right_px)
@@ -133,7 +133,7 @@ def test_halves_that_two_pairs_tie_are_doubted_where_what_tied_them_was_rejected
     tmp_path, halves
 ):
     wrong = halves
-    (told,) = wrong.models[0].told_evidence.untied
+    (told,) = wrong.models[0].evidence.untied
     assert told.images == tuple(f"{k:04d}.jpg" for k in range(1, 13))
     assert (told.num_agreeing, told.num_points, told.is_loose) == (1, 0, True)
     assert told.statement in wrong.models[0].warnings
@@ -268,7 +268,7 @@ def test_several_wrong_lenses_are_one_line_with_the_names_of_their_images():
     names = [truth.image(truth_id).name for truth_id in sorted(truth.reg_image_ids())[5:15:9]]
     given = with_own_lenses(truth, dict.fromkeys(names, 1.1))
     held = sfm_shapefit.locate(given, COURTYARD / "database.db", intrinsics="held")
-    assert len(held.told_evidence.lenses) == 2
+    assert len(held.evidence.lenses) == 2
     (line,) = (warning for warning in held.warnings if "focal length" in warning)
     freed = sfm_shapefit.locate(given, COURTYARD / "database.db")
     (changed,) = (warning for warning in freed.warnings if "focal length" in warning)

@@ -11,10 +11,10 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pipeline.inputs import RunInputs, choose_inputs, open_matches, see_matches
 from sfm_shapefit.pipeline.remedies import find_remedies
+from tests.judgement.made import place_of
 from tests.pipeline.test_evidence import with_own_lenses
 from tests.scenes import COURTYARD, RING
 
@@ -62,14 +62,15 @@ def test_a_lens_whose_image_is_left_out_is_found_too():
     held = sfm_shapefit.locate(given, COURTYARD / "database.db", intrinsics="held")
     assert name in {camera.name for camera in held.cameras if not camera.placed}
     wrong = given.find_image_with_name(name).camera_id
-    assert [told.camera for told in held.told_evidence.lenses] == [wrong]
-    assert held.told_evidence.lenses[0].asked_focal_px == pytest.approx(720.0, rel=0.002)
+    assert [told.camera for told in held.evidence.lenses] == [wrong]
+    assert held.evidence.lenses[0].asked_focal_px == pytest.approx(720.0, rel=0.002)
 
 
 @pytest.mark.parametrize(("here", "moves"), [(3, True), (4, False)])
 def test_a_camera_goes_where_twice_as_many_pairs_put_it(ring_located, here, moves):
-    pairs = np.array([(0, 2), (1, 2), (2, 3), (2, 4)])[:here]
-    place = OtherPlace(2, here, 6, np.ones(3), pairs)
+    names = ring_located.images.names
+    pairs = tuple((names[i], names[j]) for i, j in ((0, 2), (1, 2), (2, 3), (2, 4))[:here])
+    place = place_of(names[2], here, pairs_here=pairs)
     found = replace(ring_located, evidence=ModelEvidence(places=(place,)))
     model = read_model(RING / "sparse" / "0")
     inputs = choose_inputs(RING / "sparse" / "0", DATABASE)
@@ -79,8 +80,7 @@ def test_a_camera_goes_where_twice_as_many_pairs_put_it(ring_located, here, move
         remedies = list(find_remedies(found, inputs_of(found), source))
         assert len(remedies) == moves
         for remedy in remedies:
-            names = model.images.names
-            assert remedy.source.inputs.left_out == {(names[i], names[j]) for i, j in pairs.tolist()}
+            assert remedy.source.inputs.left_out == {*pairs}
             assert remedy.source.view.num_pairs == source.view.num_pairs - here
             assert remedy.applied(found).warnings[0].startswith(names[2])
 

@@ -213,7 +213,7 @@ def test_examine_finds_nothing_against_the_truth_and_a_camera_that_pairs_put_els
         moved = replace(state, images=TRUTH.placed(np.arange(8), away), placement=placement)
         wrong = examine_model(moved, Clock()).evidence
     assert (right.places, right.contradicted, right.seams) == ((), (), ())
-    assert {*(one.camera for one in wrong.places), *(one.camera for one in wrong.contradicted)} == {2}
+    assert {*(one.image for one in wrong.places), *wrong.contradicted} == {TRUTH.names[2]}
 
 
 def test_finish_tells_the_state_and_puts_what_speaks_against_the_model_first():

@@ -8,7 +8,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.files.colmap.earth import epsg_code, to_epsg
-from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.given import EarthDatum
 from tests.pipeline.made import DATABASE, FOLDER
 from tests.program import run, run_refused
 
@@ -67,7 +67,7 @@ def vertices_of(file):
     ],
 )
 def test_coordinates_are_those_of_proj(latitude, longitude, code, expected):
-    datum = Datum(latitude, longitude, 400.0)
+    datum = EarthDatum(latitude_deg=latitude, longitude_deg=longitude, altitude_m=400.0)
     far = np.array([[0.0, 0.0, 0.0], [30.0, -20.0, 5.0], [-2000.0, 100.0, 0.0], [-3000.0, 100.0, 0.0]])
     np.testing.assert_allclose(to_epsg(far[:1], datum, code)[0], expected, rtol=0.0, atol=1e-6)
     every, alone = to_epsg(far, datum, code), [to_epsg(one[None], datum, code)[0] for one in far]
@@ -87,7 +87,9 @@ def test_coordinates_are_those_of_proj(latitude, longitude, code, expected):
     ],
 )
 def test_utm_is_the_zone_of_the_datum(latitude, longitude, code):
-    assert epsg_code("UTM", Datum(latitude, longitude, 0.0)) == code
+    assert (
+        epsg_code("UTM", EarthDatum(latitude_deg=latitude, longitude_deg=longitude, altitude_m=0.0)) == code
+    )
 
 
 def test_tables_and_points_are_where_their_latitudes_are(tmp_path, placed):

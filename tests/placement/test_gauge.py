@@ -350,7 +350,7 @@ def test_a_table_is_read_by_name_with_either_separator_deviations_and_latitudes(
         f"name,lat,lon,alt\n{names[0]},48.0,11.0,500\n{names[1]},48.0,11.001,500\n{names[2]},48.001,11.0,510\n"
     )
     priors = table_priors(path, ring)
-    assert priors.datum == (48.0, 11.0, 500.0)  # medians of the three
+    assert priors.datum.geodetic == (48.0, 11.0, 500.0)  # medians of the three
     found = priors.known.positions
     # WGS84 at 48 N: a degree of longitude is 74628 m, of latitude 111200 m.
     np.testing.assert_allclose(found[1] - found[0], [74.628, 0.0, 0.0], atol=2e-2)

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_shapefit.adjustment.estimate import BundleAdjustment
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.evidence import AmbiguousPlace, GroupApart, ToldEvidence, ToldOpinion
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics
-from sfm_shapefit.facts.model import BundleAdjustment
 from sfm_shapefit.facts.placed import IN_MEMORY, KeyFigures
-from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.report import thumbnails
 from sfm_shapefit.report.charts import (
@@ -24,12 +24,13 @@ from sfm_shapefit.report.charts import (
     track_length_bars,
     view_graph_matrix,
 )
-from sfm_shapefit.report.drawing import PairClass, build_drawing, frustum_corners, view_axes
+from sfm_shapefit.report.drawing import PairClass, frustum_corners, view_axes
 from sfm_shapefit.report.first_screen import banner, scene_name, tiles
 from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
 from sfm_shapefit.report.sentences import first_looks, shorten, summary_sentences
 from sfm_shapefit.report.thumbnails import read_thumbnails
-from tests.drawings import make_drawing
+from tests.drawings import draw, make_drawing, table_of
+from tests.judgement.made import group_apart, opinion_with, place_of
 
 HOSTILE = [
     "<script>document.title='owned'</script>.jpg",
@@ -174,22 +175,12 @@ def doubted():
     drawing, facts = make_drawing()
     names = drawing.cameras.names
 
-    def apart(rows):
-        images = tuple(names[k] for k in rows)
-        return GroupApart(images=images, num_agreeing=1, num_contradicting=9, num_turned=0, turn_deg=None)
+    def apart(*rows):
+        return group_apart(*(names[k] for k in rows))
 
-    place = AmbiguousPlace(image=names[9], num_here=2, num_there=5, offset=(1.0, 2.0, -0.5))
-    second = ToldOpinion(
-        num_common=25,
-        usual=1e-3,
-        wrong=(names[4], names[12]),
-        undecided=(),
-        num_for=0,
-        num_against=9,
-        ambiguous=(),
-        has_nothing_in_common=False,
-    )
-    evidence = ToldEvidence(places=(place,), seams=(apart([4, 5]), apart([3, 4, 5, 6])), second=second)
+    place = replace(place_of(names[9], 2, 5), offset=(1.0, 2.0, -0.5))
+    second = opinion_with(wrong=(names[4], names[12]))
+    evidence = ModelEvidence(places=(place,), seams=(apart(4, 5), apart(3, 4, 5, 6)), second=second)
     return drawing, replace(facts, evidence=evidence, warnings=evidence.statements)
 
 
@@ -305,7 +296,9 @@ def test_tiles_tell_errors_in_pixels_and_degrees_and_how_uncertain_positions_are
     assert shown["typical error of a pair"] == "1.4 px, 0.08°"
     assert shown["camera to check"] == "1"
     assert shown["typical uncertainty, 0.07% of the scene"] == "± 0.015 units"
-    facts = replace(facts, figures=KeyFigures.of_cameras((), None, 1000.0, "units"))  # nothing is known
+    facts = replace(
+        facts, figures=KeyFigures.of_cameras(table_of([], CameraRow), None, 1000.0, "units")
+    )  # nothing is known
     labels = [tile["label"] for tile in tiles(drawing, facts)]
     assert not any(label.startswith(("typical error", "typical uncertainty")) for label in labels)
 
@@ -320,11 +313,11 @@ def test_an_ellipsoid_lies_along_the_axes_of_the_covariance_and_survives_the_way
     products = halves @ halves.T  # they are orthogonal
     np.testing.assert_allclose(products - np.diag(np.diag(products)), 0.0, atol=1e-9)
     row = CameraRow(name="a", placed=True, center=(0, 0, 0), sigma=(3.0, 4.0, 1.0), correlation=(1.0, 0, 0))
-    long = build_drawing([row], []).cameras.ellipsoids[0, 2]  # errors along x and y are one and the same
+    long = draw([row], []).cameras.ellipsoids[0, 2]  # errors along x and y are one and the same
     np.testing.assert_allclose(np.abs(long), [3.0, 4.0, 0.0], atol=1e-9)
     plane = CameraRow(name="a", placed=True, center=(0, 0), sigma=(3.0, 4.0), correlation=(1.0,))
     np.testing.assert_allclose(
-        np.abs(build_drawing([plane], []).cameras.ellipsoids[0, 2]), [3, 4, 0], atol=1e-9
+        np.abs(draw([plane], [], dimension=2).cameras.ellipsoids[0, 2]), [3, 4, 0], atol=1e-9
     )
 
 
@@ -385,9 +378,9 @@ def test_thumbnails_are_small_in_all_and_only_of_files_inside_the_folder(tmp_pat
 
 
 def test_a_pair_that_is_off_by_little_does_not_contradict():
-    for residual_deg, contradicts in ((0.05, False), (1.5, True), (float("nan"), True)):
-        row = PairRow(name1="a", name2="b", verdict="outlier", residual_deg=residual_deg)
-        assert row.contradicts == contradicts
+    told = {"name1": "aaa", "name2": "bbb", "verdict": ["outlier"] * 3, "residual_deg": [0.05, 1.5, np.nan]}
+    columns = {name: list(values) for name, values in told.items()}
+    assert contradicting(Table(PairRow, 3, columns)).tolist() == [False, True, True]
 
 
 def test_a_good_model_lists_no_task():
@@ -423,7 +416,7 @@ def test_the_title_is_the_name_of_the_scene(inputs, title):
 
 def test_nothing_known_nothing_claimed():
     drawing, facts = make_drawing(num_cameras=3, num_pairs=2, num_points=0)
-    figures = KeyFigures.of_cameras((), None, 1000.0, "units")
+    figures = KeyFigures.of_cameras(table_of([], CameraRow), None, 1000.0, "units")
     none = {
         "residual_level_deg": None,
         "mean_reprojection_error_px": None,

@@ -14,7 +14,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.geodesy import earth
-from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.given import EarthDatum
 
 _ECEF = 4978  # EPSG code; Earth-centered, Earth-fixed
 _NORTH, _SOUTH = 32600, 32700  # EPSG codes; those of a hemisphere's zones are larger by their numbers
@@ -22,7 +22,7 @@ _FALSE_NORTHING = 1e7  # meters; so that no northing of the south is negative
 _FARTHEST_DEG = 9.0  # degrees from the middle of a zone, a zone further; the grid bends beyond
 
 
-def epsg_code(name: str, datum: Datum) -> int:
+def epsg_code(name: str, datum: EarthDatum) -> int:
     """Return the EPSG code that a user names for a scene around a datum; `utm` is the zone that it lies in.
 
     Raises:
@@ -41,19 +41,19 @@ def epsg_code(name: str, datum: Datum) -> int:
     return code
 
 
-def to_epsg(places: FloatArray, datum: Datum, code: int) -> FloatArray:
+def to_epsg(places: FloatArray, datum: EarthDatum, code: int) -> FloatArray:
     """Return places (k, 3), in meters east, north and up of a datum, as coordinates of an EPSG code."""
     transform = earth()
     if code == _ECEF:
-        return np.asarray(transform.enu_to_ecef(places, *datum))
-    geodetic = np.asarray(transform.enu_to_ellipsoid(places, *datum))
+        return np.asarray(transform.enu_to_ecef(places, *datum.geodetic))
+    geodetic = np.asarray(transform.enu_to_ellipsoid(places, *datum.geodetic))
     votes = np.tile([0.0, _middle_deg(code), 0.0], (len(places) + 1, 1))  # for the zone, against all rows
     found = np.asarray(transform.ellipsoid_to_utm(np.concatenate([votes, geodetic]))[0])[len(votes) :]
     found[:, 1] += _FALSE_NORTHING * ((code > _SOUTH) - (geodetic[:, 0] < 0.0).astype(np.float64))
     return found
 
 
-def _zone_of(datum: Datum) -> int:
+def _zone_of(datum: EarthDatum) -> int:
     """Return the EPSG code of the zone of UTM that a datum lies in; off Norway they have other widths."""
     latitude, longitude = datum.latitude_deg, _wrapped(datum.longitude_deg)
     zone = int((longitude + 180.0) // 6.0) + 1

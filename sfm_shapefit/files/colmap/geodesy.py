@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.given import EarthDatum
 
 _LOCAL = {"local", "enu"}
 _GEODETIC = re.compile(r"(epsg:4326|epsg:4979|wgs84|.*\+proj=(latlong|longlat)\b.*)")
@@ -68,15 +68,16 @@ def unwrapped(longitudes: FloatArray) -> FloatArray:
     return ways[best] if apart[best] < _MUCH_CLOSER * apart[0] else longitudes
 
 
-def datum_of(geodetic: FloatArray) -> Datum:
+def datum_of(geodetic: FloatArray) -> EarthDatum:
     """Return the median of positions (k, 3), latitude, longitude in degrees and altitude, on either side of
     the 180th meridian. Near a pole, where longitudes scatter, it is a point near them."""
     latitude, altitude = np.median(geodetic[:, [0, 2]], axis=0).tolist()
     longitude = float(np.median(unwrapped(geodetic[:, 1])))
-    return Datum(latitude, longitude if longitude <= 180.0 else longitude - 360.0, altitude)
+    longitude -= 360.0 * (longitude > 180.0)
+    return EarthDatum(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude)
 
 
-def enu_of(geodetic: FloatArray, datum: Datum) -> FloatArray:
+def enu_of(geodetic: FloatArray, datum: EarthDatum) -> FloatArray:
     """Return positions (k, 3), latitude, longitude in degrees and altitude, in meters east, north and up.
 
     Raises:
@@ -87,7 +88,7 @@ def enu_of(geodetic: FloatArray, datum: Datum) -> FloatArray:
         is_swapped = (latitudes <= 360.0).all() and (longitudes <= 90.0).all()
         remedy = "are they swapped?" if is_swapped else "give degrees"
         raise ValueError(f"a latitude or longitude is out of range; {remedy}")
-    return np.asarray(earth().ellipsoid_to_enu(np.ascontiguousarray(geodetic), *datum))
+    return np.asarray(earth().ellipsoid_to_enu(np.ascontiguousarray(geodetic), *datum.geodetic))
 
 
 def _plain(line: str) -> str:

@@ -9,7 +9,13 @@ import pycolmap
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, name_of, points2d_xy, transform_model
+from sfm_shapefit.files.colmap.reconstructions import (
+    add_point,
+    bytes_of_name,
+    name_of,
+    points2d_xy,
+    transform_model,
+)
 
 _LEAST_TRACK = 2  # observations; a point with fewer is none
 _SAME_PIXEL = 0.5  # pixels; keypoints of two models that are no farther apart are one
@@ -164,7 +170,7 @@ def _add_points(
     last = max(joined.point3D_ids(), default=0)
     for point_id in sorted(second.point3D_ids()):
         point = second.point3D(point_id)
-        track, meets = pycolmap.Track(), set()
+        fresh, meets = list[tuple[int, int]](), set[int]()
         for element in point.track.elements:
             if element.image_id not in places:
                 continue
@@ -173,14 +179,12 @@ def _add_points(
             if seen.has_point3D():
                 meets.add(int(seen.point3D_id))
             else:
-                track.add_element(image_id, place)
-        if track.length() + len(meets) < _LEAST_TRACK or not track.length():
+                fresh.append((image_id, place))
+        if len(fresh) + len(meets) < _LEAST_TRACK or not fresh:
             continue
         last += 1
         new[point_id] = last
-        copy = pycolmap.Point3D(xyz=point.xyz, track=track)
-        copy.color = point.color
-        joined.add_point3D_with_id(last, copy)
+        add_point(joined, last, point.xyz, point.color, fresh)
         same += [(one, last) for one in sorted(meets)[:1]]
     return new, same
 

@@ -31,7 +31,7 @@ from sfm_shapefit.files.colmap.lenses import lens_of, rays_of
 from sfm_shapefit.files.colmap.picture_colors import read_picture
 from sfm_shapefit.files.colmap.points import points2d_of, points_of
 from sfm_shapefit.files.colmap.quiet import quiet_log
-from sfm_shapefit.files.colmap.reconstructions import arrays_of, bytes_of_name, name_of
+from sfm_shapefit.files.colmap.reconstructions import add_point, arrays_of, bytes_of_name, name_of
 from sfm_shapefit.scene.points import Points
 
 # Radians off the axis, in the middle of a side: there, a pinhole stretches pixels outward by 1 / cos^2 = 4.
@@ -270,14 +270,11 @@ def _add_points(
 ) -> None:
     """Add points to a model; their observations index its images (i,) by these ids."""
     bounds = itertools.pairwise(points.offsets.tolist())
+    seen = list(zip(image_ids[points.images].tolist(), points.keypoints.tolist(), strict=True))
     for point_id, (begin, end), xyz, color in zip(
         points.ids.tolist(), bounds, points.xyz, colors, strict=True
     ):
-        track = pycolmap.Track()
-        ids = image_ids[points.images[begin:end]].tolist()
-        for image_id, keypoint in zip(ids, points.keypoints[begin:end].tolist(), strict=True):
-            track.add_element(image_id, keypoint)
-        made.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=xyz, track=track, color=color))
+        add_point(made, point_id, xyz, color, seen[begin:end])
 
 
 def _sensor_id(camera_id: int) -> pycolmap.sensor_t:

@@ -13,7 +13,7 @@ from pathlib import Path
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.position_table import PositionSystem, PositionTable, read_columns
 from sfm_shapefit.files.json_node import JsonNode, read_json
-from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.given import EarthDatum
 
 _ONLY = {"sensor_type": "CAMERA", "translation_convention": "WORLD_FROM_CAM", "ellipsoid": "WGS84"}
 """What is read, by key; it is so where the file does not say."""
@@ -41,7 +41,8 @@ def read_pose_prior_json(path: Path) -> PositionTable:
         for number, row in enumerate(root.get("data").elements(), start=1)
     }
     table = read_columns(path, header, rows)
-    origin = root.get("enu_origin").numbers(3) if told == "CARTESIAN" and root.has("enu_origin") else None
-    return table._replace(
-        system=_SYSTEMS.get(told, table.system), datum=None if origin is None else Datum(*origin)
-    )
+    datum = None
+    if told == "CARTESIAN" and root.has("enu_origin"):
+        latitude, longitude, altitude = root.get("enu_origin").numbers(3)
+        datum = EarthDatum(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude)
+    return table._replace(system=_SYSTEMS.get(told, table.system), datum=datum)

@@ -24,7 +24,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.files.colmap.geodesy import Projection, is_projection, projection_named
 from sfm_shapefit.files.lines import cells_of, is_database, lines_of_cells, text_of
-from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.given import EarthDatum
 
 LARGEST = 1e30  # units; sums of squares of squares of larger coordinates or sigmas overflow
 _FORM = "a name, three coordinates, and none, one or three standard deviations"
@@ -84,7 +84,7 @@ class PositionTable(NamedTuple):
     system: PositionSystem
     notes: tuple[str, ...] = ()
     """What was read otherwise than it stands, or not at all, a sentence each."""
-    datum: Datum | None = None
+    datum: EarthDatum | None = None
     """Where the origin of metric positions is on Earth, if that is known."""
 
     def part(self, rows: BoolArray) -> "PositionTable":

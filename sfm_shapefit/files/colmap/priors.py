@@ -28,7 +28,7 @@ from sfm_shapefit.files.colmap.position_table import (
     read_position_table,
 )
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.scene.given import Datum, PositionPriors
+from sfm_shapefit.scene.given import EarthDatum, PositionPriors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.same_images import same_images
@@ -118,7 +118,7 @@ def exif_priors(folder: Path, images: Images) -> PositionPriors:
     return _priors(table, images, str(folder), f"EXIF data of {len(found)} images of {folder}")
 
 
-def in_meters(table: PositionTable, source: str, datum: Datum | None = None) -> PositionTable:
+def in_meters(table: PositionTable, source: str, datum: EarthDatum | None = None) -> PositionTable:
     """Return the positions that are known, those on Earth in meters about a datum, their median if None.
 
     Altitudes that are missing are the median of the others, or 0. InputError if latitudes or longitudes are

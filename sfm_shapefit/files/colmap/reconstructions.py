@@ -5,7 +5,9 @@ and objects of them one by one take ten times as long. The files lack whether a 
 frames and sensors without a pose stand at the origin on their way.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -129,3 +131,13 @@ def transform_model(
     rotation = pycolmap.Rotation3d(similarity.rotation)
     copy.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
     return copy
+
+
+def add_point(
+    model: pycolmap.Reconstruction, point_id: int, xyz: Any, color: Any, seen: Iterable[tuple[int, int]]
+) -> None:
+    """Add a point that observations see, each an image's id and the number of its points2D."""
+    track = pycolmap.Track()
+    for image_id, place in seen:
+        track.add_element(image_id, place)
+    model.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=xyz, track=track, color=color))

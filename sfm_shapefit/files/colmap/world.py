@@ -14,7 +14,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, nearest_rotations
 from sfm_shapefit.files.colmap.earth import epsg_code, to_epsg
 from sfm_shapefit.files.lines import is_number
-from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.given import EarthDatum
 from sfm_shapefit.scene.images import Images
 
 _STEP = 100.0  # meters, half the distance over which turn and scale are measured; the error is below 1e-9
@@ -26,7 +26,7 @@ _ROUND = 100.0  # units; offsets that are found are multiples of it, as surveyor
 class World:
     """Where what is written stands."""
 
-    datum: Datum | None = None
+    datum: EarthDatum | None = None
     """Where the model's own axes are on Earth; None where no other system is asked for."""
     code: int = 0
     """EPSG code of the system; 0 without one."""
@@ -89,7 +89,7 @@ class World:
         )
 
 
-def world_of(datum: Datum | None, centers: FloatArray, crs: str, offset: str) -> World:
+def world_of(datum: EarthDatum | None, centers: FloatArray, crs: str, offset: str) -> World:
     """Return the world in which a model is to be written.
 
     Args:

@@ -21,8 +21,8 @@ const drawHead = () => {
 const commandHere = (command) => {
   const inside = location.protocol === "file:" ? decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "") : "OUT";
   const quote = (path) => (/^[\w@%+=:,./-]+$/.test(path) ? path : `'${path.replaceAll("'", "'\\''")}'`);
-  const named = command.replace(" IMAGES ", ` ${quote(data.images)} `);
-  return named.replaceAll(/\{out(\w*)\}/g, (_, further) => quote(inside + further));
+  const folders = { images: data.images, out: inside, out_dense: `${inside}_dense` };
+  return command.replaceAll(/\{(\w+)\}/g, (word, name) => (name in folders ? quote(folders[name]) : word));
 };
 const copyCommand = async () => {
   const text = $("command").textContent;

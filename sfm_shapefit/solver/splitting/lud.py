@@ -14,12 +14,13 @@ negative join the others, and the repair is repeated.
 Source: Ozyesil and Singer, "Robust camera location estimation by convex programming", CVPR 2015, eq. 7.
 """
 
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
 from sfm_shapefit.solver.options import OnIteration
@@ -35,19 +36,15 @@ _CG_TOL = 1e-7  # residual to which the balance is restored; twice, which makes 
 _CG_STEPS = 300  # conjugate gradient steps; a bound
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LudResult:
-    """A solution of LUD with the bound that its dual proves."""
+class Lud(Record):
+    """The LUD start and its own dual bound, in its own units."""
 
+    objective: Annotated[float, "Value of the LUD program at its start."]
+    dual_bound: Annotated[float | None, "No placement has a lower objective."]
+    equality_residual: Annotated[float | None, "Violation of the dual's equality, as in `Solve`."]
+    iterations: Annotated[int, "Iterations of its solver."]
     locations: FloatArray
     """(n, d) centered; the least edge length is about 1."""
-    objective: float
-    """sum_e w_e ||t_i - t_j - s_e v_e||."""
-    dual_bound: float
-    """No locations have an objective below this, up to `equality_residual`; 0 if it was not asked for."""
-    equality_residual: float
-    """Largest violation of D^T y = 0 at a camera, relative to the largest weighted degree."""
-    iterations: int
     stop: Stop
     """Why the iteration ended."""
 
@@ -61,7 +58,7 @@ def solve_lud(
     certified: bool = True,
     resources: Resources = ONE_THREAD,
     on_iteration: OnIteration | None = None,
-) -> LudResult:
+) -> Lud:
     """Solve LUD by ADMM with constant penalties, so that its Laplacian is factored once.
 
     Args:
@@ -88,7 +85,7 @@ def solve_lud(
     if certified:
         factor.refactor(np.ones(graph.num_edges))
         bound, residual = _dual_bound(graph, dual, factor)
-    return LudResult(
+    return Lud(
         locations=t,
         objective=float(graph.weights @ deviations),
         dual_bound=bound,
