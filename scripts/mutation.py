@@ -51,7 +51,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "certificate": (("solver/certificate.py",), ("certificate", "exact_certificate", "solver")),
     "newton": (("solver/newton/*.py",), ("newton", "exact_certificate", "solver")),
     "splitting": (("solver/splitting/*.py",), ("splitting", "certificate", "exact_certificate")),
-    "program": (("solver/program.py", "solver/options.py"), ("solver", "newton")),
+    "program": (("solver/program.py", "solver/solver_options.py"), ("solver", "newton")),
     "solve": (("solver/solve.py",), ("solver", "certificate", "splitting", "rigid_groups")),
     "angular": (("refinement/angular.py",), ("angular",)),
     "reduction": (("solver/reduction.py", "solver/tied.py"), ("rigid_groups",)),

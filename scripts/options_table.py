@@ -9,7 +9,7 @@ from dataclasses import fields
 from sfm_shapefit.base.settings import Option, Settings, setting_groups
 from sfm_shapefit.cli import app
 from sfm_shapefit.cli.flags import brief_help
-from sfm_shapefit.facts.options import LocateOptions, MapOptions
+from sfm_shapefit.facts.command_options import LocateOptions, MapOptions
 
 
 def homes(settings: type[Settings], prefix: str = "") -> Iterator[tuple[str, str]]:

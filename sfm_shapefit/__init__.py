@@ -26,23 +26,23 @@ from typing import TYPE_CHECKING
 from typing import Any as _Any
 
 if TYPE_CHECKING:
-    from sfm_shapefit.adjustment.options import AdjustmentOptions as AdjustmentOptions
+    from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions as AdjustmentOptions
     from sfm_shapefit.base.errors import InputError as InputError
     from sfm_shapefit.base.errors import ShapeFitError as ShapeFitError
     from sfm_shapefit.base.errors import UnsolvableError as UnsolvableError
+    from sfm_shapefit.facts.command_options import InspectOptions as InspectOptions
+    from sfm_shapefit.facts.command_options import JoinOptions as JoinOptions
+    from sfm_shapefit.facts.command_options import LocateOptions as LocateOptions
+    from sfm_shapefit.facts.command_options import MapOptions as MapOptions
+    from sfm_shapefit.facts.command_options import SourceOptions as SourceOptions
     from sfm_shapefit.facts.map_result import JoinedModel as JoinedModel
     from sfm_shapefit.facts.map_result import MapResult as MapResult
-    from sfm_shapefit.facts.options import InspectOptions as InspectOptions
-    from sfm_shapefit.facts.options import JoinOptions as JoinOptions
-    from sfm_shapefit.facts.options import LocateOptions as LocateOptions
-    from sfm_shapefit.facts.options import MapOptions as MapOptions
-    from sfm_shapefit.facts.options import SourceOptions as SourceOptions
     from sfm_shapefit.facts.result import LocateResult as LocateResult
     from sfm_shapefit.files.colmap.quiet import hear_pycolmap as hear_pycolmap
-    from sfm_shapefit.files.options import MatchingOptions as MatchingOptions
+    from sfm_shapefit.files.matching_options import MatchingOptions as MatchingOptions
     from sfm_shapefit.graph.viewgraph import ViewGraph as ViewGraph
-    from sfm_shapefit.judgement.options import TrustOptions as TrustOptions
-    from sfm_shapefit.pairs.options import DirectionOptions as DirectionOptions
+    from sfm_shapefit.judgement.trust_options import TrustOptions as TrustOptions
+    from sfm_shapefit.pairs.direction_options import DirectionOptions as DirectionOptions
     from sfm_shapefit.pipeline.bundle_adjust import AdjustedModel as AdjustedModel
     from sfm_shapefit.pipeline.bundle_adjust import bundle_adjust as bundle_adjust
     from sfm_shapefit.pipeline.check import check as check
@@ -63,26 +63,26 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.workspace import workspace as workspace
     from sfm_shapefit.pipeline.write import WriteOptions as WriteOptions
     from sfm_shapefit.pipeline.write import write_result as write_result
-    from sfm_shapefit.placement.options import GaugeOptions as GaugeOptions
+    from sfm_shapefit.placement.gauge_options import GaugeOptions as GaugeOptions
     from sfm_shapefit.placement.place import Placement as Placement
-    from sfm_shapefit.refinement.options import PlacementOptions as PlacementOptions
+    from sfm_shapefit.refinement.placement_options import PlacementOptions as PlacementOptions
     from sfm_shapefit.rotations.average import average_rotations as average_rotations
     from sfm_shapefit.rotations.averaged import AveragedRotations as AveragedRotations
-    from sfm_shapefit.rotations.options import AveragingOptions as AveragingOptions
+    from sfm_shapefit.rotations.averaging_options import AveragingOptions as AveragingOptions
     from sfm_shapefit.scene.freedom import FreedomOptions as FreedomOptions
     from sfm_shapefit.solver.certificate import Certificate as Certificate
     from sfm_shapefit.solver.certificate import certify as certify
-    from sfm_shapefit.solver.options import SolverOptions as SolverOptions
-    from sfm_shapefit.solver.options import SolverResult as SolverResult
-    from sfm_shapefit.solver.options import Status as Status
     from sfm_shapefit.solver.solve import solve as solve
-    from sfm_shapefit.tracks.options import NodeOptions as NodeOptions
-    from sfm_shapefit.tracks.options import StructureOptions as StructureOptions
+    from sfm_shapefit.solver.solver_options import SolverOptions as SolverOptions
+    from sfm_shapefit.solver.solver_options import SolverResult as SolverResult
+    from sfm_shapefit.solver.solver_options import Status as Status
+    from sfm_shapefit.tracks.structure_options import NodeOptions as NodeOptions
+    from sfm_shapefit.tracks.structure_options import StructureOptions as StructureOptions
 
 _HOMES = {
     "files.colmap.quiet": ("hear_pycolmap",),
-    "files.options": ("MatchingOptions",),
-    "adjustment.options": ("AdjustmentOptions",),
+    "files.matching_options": ("MatchingOptions",),
+    "adjustment.adjustment_options": ("AdjustmentOptions",),
     "pipeline.bundle_adjust": ("AdjustedModel", "bundle_adjust"),
     "pipeline.check": ("check", "check_pieces"),
     "pipeline.referee": ("CheckResult",),
@@ -98,22 +98,28 @@ _HOMES = {
     "pipeline.workspace": ("Workspace", "workspace"),
     "pipeline.write": ("WriteOptions", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
-    "facts.options": ("InspectOptions", "JoinOptions", "LocateOptions", "MapOptions", "SourceOptions"),
-    "judgement.options": ("TrustOptions",),
-    "pairs.options": ("DirectionOptions",),
-    "placement.options": ("GaugeOptions",),
-    "rotations.options": ("AveragingOptions",),
+    "facts.command_options": (
+        "InspectOptions",
+        "JoinOptions",
+        "LocateOptions",
+        "MapOptions",
+        "SourceOptions",
+    ),
+    "judgement.trust_options": ("TrustOptions",),
+    "pairs.direction_options": ("DirectionOptions",),
+    "placement.gauge_options": ("GaugeOptions",),
+    "rotations.averaging_options": ("AveragingOptions",),
     "scene.freedom": ("FreedomOptions",),
-    "tracks.options": ("NodeOptions", "StructureOptions"),
+    "tracks.structure_options": ("NodeOptions", "StructureOptions"),
     "pipeline.place": ("place",),
     "placement.place": ("Placement",),
-    "refinement.options": ("PlacementOptions",),
+    "refinement.placement_options": ("PlacementOptions",),
     "facts.map_result": ("JoinedModel", "MapResult"),
     "facts.result": ("LocateResult",),
     "rotations.average": ("average_rotations",),
     "rotations.averaged": ("AveragedRotations",),
     "solver.certificate": ("Certificate", "certify"),
-    "solver.options": ("SolverOptions", "SolverResult", "Status"),
+    "solver.solver_options": ("SolverOptions", "SolverResult", "Status"),
     "solver.solve": ("solve",),
     "graph.viewgraph": ("ViewGraph",),
 }

@@ -11,7 +11,7 @@ from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.report.drawing import Poses, build_drawing
-from sfm_shapefit.solver.options import Solve
+from sfm_shapefit.solver.solver_options import Solve
 
 UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7
 

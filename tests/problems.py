@@ -17,9 +17,9 @@ from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.refinement import starts
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
-from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.reduction import Reduction
+from sfm_shapefit.solver.solver_options import OnIteration
 from sfm_shapefit.solver.splitting.engine import Goal
 from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources, laplacian_factor
 from sfm_shapefit.solver.splitting.lud import solve_lud

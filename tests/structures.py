@@ -14,12 +14,12 @@ from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_trac
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.files.colmap.images import images_of, put_images
 from sfm_shapefit.files.colmap.point_colors import color_points, read_colors
-from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
+from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
 from sfm_shapefit.files.colmap.reconstructions import reconstruction_of
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.tracks.filter import filter_points
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 from tests.models import arrays
 
 
@@ -56,7 +56,7 @@ def colored(model, original):
 
 def pictures_of(model, images):
     """The points2D of a model."""
-    return ModelPictures(images, points2d_of(arrays(model), images))
+    return ModelKeypoints(images, points2d_of(arrays(model), images))
 
 
 def links_of(model, tracks) -> Links:

@@ -6,9 +6,9 @@ from functools import partial
 import numpy as np
 
 from sfm_shapefit.adjustment import run as steps
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors, without_unseen_turns
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES, AdjustmentRun
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import ObservedTracks

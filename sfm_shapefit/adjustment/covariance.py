@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.gauge import free_similarities, small_similarities
 from sfm_shapefit.adjustment.layout import SLOTS, Layout, lay_out
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.reduced_factor import InvertedFactor, ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points

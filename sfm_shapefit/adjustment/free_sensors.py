@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import estimate_covariances
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError

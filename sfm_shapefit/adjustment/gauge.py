@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import cross_matrices
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.residuals import Values

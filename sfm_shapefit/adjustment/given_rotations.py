@@ -46,8 +46,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.freedom import Freedom
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.solve import adjust, costs_of_frames, reprojection_errors_px
 from sfm_shapefit.base.arrays import BoolArray, FloatArray

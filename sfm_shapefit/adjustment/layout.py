@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, frozen
 from sfm_shapefit.base.geometry import normalized, tangent_bases

@@ -10,8 +10,8 @@ scene, the similarity of the centers taken off.
 
 import numpy as np
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import GroundedSystem, ground_system, motions_read_by
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.solve import linearize_all, values_of
 from sfm_shapefit.base.arrays import FloatArray, IntArray

@@ -8,9 +8,9 @@ doubt s: its camera stands off along its view by s times the depth of what it se
 
 import numpy as np
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_shares
 from sfm_shapefit.adjustment.freedom import Freedom
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.scene.images import Images

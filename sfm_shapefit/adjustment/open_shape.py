@@ -29,7 +29,7 @@ from sfm_shapefit.base.geometry import INSIDE, distances_in_spreads, fit_similar
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import PARTS, Lens, Origin
 from sfm_shapefit.tracks.links import ObservedTracks
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 
 # Relative fall of the cost at which the drift ends. With 1e-5 and all points it takes three times as long; it
 # is then the same on sound models, and .262 instead of .257 of the extent on the undetermined one.

@@ -17,9 +17,9 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.iterative_factor import UNDETERMINED, IterativeFactor
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.schur import ReducedSystem
 from sfm_shapefit.base.arrays import FloatArray, IntArray

@@ -30,13 +30,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_shares
 from sfm_shapefit.adjustment.estimate import BundleAdjustment, Estimate
 from sfm_shapefit.adjustment.free_sensors import judge_sensors
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import RotationErrors
 from sfm_shapefit.adjustment.lens_doubts import covariances_of_open_lenses, errors_of_free_lenses
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.shared_errors import CenterErrors, estimate_center_errors
 from sfm_shapefit.adjustment.solve import (
@@ -54,7 +54,7 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import FOCAL
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.thin_tracks import choose_thin_tracks
 from sfm_shapefit.tracks.triangulation import (
     PointLimits,
@@ -495,7 +495,6 @@ def solve_placed(run: AdjustmentRun, problem: AdjustmentProblem, fall: float) ->
 
 
 def _solve_all(run: AdjustmentRun) -> Solved:
-    """Return the run after a first solve by all points."""
     return run.solve(run.problem_of_all()[2], FIRST_FALL, settles_points=True)
 
 

@@ -37,9 +37,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import GroundedSystem, ground_system
 from sfm_shapefit.adjustment.layout import SLOTS
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.projection import (
     SHIFT,

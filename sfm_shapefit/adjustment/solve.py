@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_baselines, restore_gauge
 from sfm_shapefit.adjustment.layout import Layout, lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import add_priors, sum_priors
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.reduced_factor import choose_solver
@@ -230,8 +230,6 @@ def linearize_all(
 
 
 class _Run:
-    """One adjustment under way."""
-
     def __init__(self, problem: AdjustmentProblem, options: AdjustmentOptions) -> None:
         self.problem, self.options = problem, options
         self.workers = Workers(options.threads)

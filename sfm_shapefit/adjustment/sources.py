@@ -11,7 +11,7 @@ from sfm_shapefit.adjustment.views import CUBE, views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import connected_components
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
@@ -24,7 +24,7 @@ _MATCHES_A_SLICE = 1_000_000  # matches renumbered at once; more would take a se
 
 def collect_matches(
     images: Images,
-    pictures: Pictures,
+    pictures: KeypointRays,
     place: IntArray,
     batches: Iterable[KeypointMatches],
     num_matches: int,
@@ -78,7 +78,7 @@ def collect_matches(
     )
 
 
-def collect_tracks(images: Images, pictures: Pictures, points: Points) -> ObservedTracks:
+def collect_tracks(images: Images, pictures: KeypointRays, points: Points) -> ObservedTracks:
     """Return the tracks of points that posed images observe; they keep the points' ids and order."""
     order = np.argsort(points.images, kind="stable")
     cameras, pixels, on_plane = _look_up(images, pictures, points.images[order], points.keypoints[order])
@@ -130,7 +130,7 @@ def _on_plane(rays: FloatArray) -> FloatArray:
 
 
 def _look_up(
-    images: Images, pictures: Pictures, of: IntArray | Int32Array, keypoints: IntArray | Int32Array
+    images: Images, pictures: KeypointRays, of: IntArray | Int32Array, keypoints: IntArray | Int32Array
 ) -> tuple[Int32Array, npt.NDArray[np.floating], FloatArray]:
     """Return camera, pixels (m, 2) and x/z, y/z (m, 2) of keypoints; the images that they are `of` ascend."""
     cameras = np.searchsorted(views_of(images).images, of).astype(np.int32)

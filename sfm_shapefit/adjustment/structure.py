@@ -28,7 +28,7 @@ from sfm_shapefit.base.executors import Advance, nobody
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points, concatenate_points, number_points
 from sfm_shapefit.tracks.links import ObservedTracks
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.triangulation import (
     PointLimits,
     joining_limits_px,
@@ -99,5 +99,4 @@ def triangulate(
 
 
 def _blocks(chosen: IntArray) -> Iterator[IntArray]:
-    """Yield some of the chosen tracks at a time."""
     return (chosen[first : first + _TRACKS_A_BLOCK] for first in range(0, len(chosen), _TRACKS_A_BLOCK))

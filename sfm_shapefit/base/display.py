@@ -83,7 +83,6 @@ class Displayed:
         return f"<{type(self).__name__}: {self._headline()}>"
 
     def _repr_html_(self) -> str:
-        """Return a table of the summary."""
         rows = ((name.replace("_", " "), _text_of(value)) for name, value in self.summary().items())
         return f"<table><caption>{html.escape(repr(self))}</caption>{_table_rows(rows)}</table>"
 

@@ -101,8 +101,6 @@ def function_address(module: str, name: str) -> int:
 
 
 def _call_address(_context: Any, address: Any, pointers: Any) -> Any:
-    """Type `call_address(address, pointers)` and generate its code."""
-
     def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         function, packed = arguments
         void_pointer = cgutils.voidptr_t
@@ -124,8 +122,6 @@ array after its last use by name.
 
 
 def _array_address(_context: Any, array: Any) -> Any:
-    """Type `array_address(array)` and generate its code."""
-
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
         return builder.ptrtoint(data, context.get_value_type(types.int64))
@@ -140,8 +136,6 @@ array_address = intrinsic(_array_address)
 def _multiply_in_lanes(
     _context: Any, panel: Any, _at: Any, _leading: Any, vectors: Any, _start: Any, _count: Any, sums: Any
 ) -> Any:
-    """Type `multiply_in_lanes` and generate its code."""
-
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         integer = context.get_value_type(types.int64)
         number = context.get_value_type(signature.args[0].dtype)
@@ -197,8 +191,6 @@ def _multiply_in_lanes(
 
 
 def _subtract_block(_context: Any, spread: Any, rows: Any, _row: Any, blocks: Any, _block: Any) -> Any:
-    """Type `subtract_block` and generate its code."""
-
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         integer = context.get_value_type(types.int64)
         number = context.get_value_type(types.float64)

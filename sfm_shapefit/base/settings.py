@@ -217,7 +217,6 @@ def _fits(value: object, kind: Any) -> bool:
 
 
 def _wanted(kind: Any) -> str:
-    """Say what a field takes."""
     if get_origin(kind) is Literal:
         return f"one of {', '.join(get_args(kind))}"
     if get_origin(kind) in (Union, types.UnionType):

@@ -394,7 +394,7 @@ def _describe_unknown(name: str, known: Sequence[str]) -> str:
 
 
 def _commands_with(name: str) -> str:
-    from sfm_shapefit.facts.options import InspectOptions, JoinOptions, LocateOptions, MapOptions
+    from sfm_shapefit.facts.command_options import InspectOptions, JoinOptions, LocateOptions, MapOptions
 
     kinds = {"locate": LocateOptions, "map": MapOptions, "join": JoinOptions, "inspect": InspectOptions}
     return " and ".join(command for command, kind in kinds.items() if name in homes_of(kind))

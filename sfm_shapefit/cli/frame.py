@@ -23,8 +23,8 @@ from sfm_shapefit.cli.console import (
 )
 from sfm_shapefit.cli.flags import OutputFlags, read_options
 from sfm_shapefit.cli.progress import show_progress
-from sfm_shapefit.facts.options import FIX_SOLVED
-from sfm_shapefit.files.options import MADE_FIRST
+from sfm_shapefit.facts.command_options import FIX_SOLVED
+from sfm_shapefit.files.matching_options import MADE_FIRST
 
 if TYPE_CHECKING:
     from sfm_shapefit.base.clock import Progress

@@ -22,7 +22,7 @@ from sfm_shapefit.cli.flags import (
 )
 from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.facts.options import InspectOptions
+from sfm_shapefit.facts.command_options import InspectOptions
 
 
 @app.command(

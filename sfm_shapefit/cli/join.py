@@ -8,7 +8,7 @@ import typer
 from sfm_shapefit.cli.flags import Database, GroupedCommand, OutputFlags, flags_of, takes
 from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.facts.options import JoinOptions
+from sfm_shapefit.facts.command_options import JoinOptions
 
 
 @app.command(

@@ -18,7 +18,7 @@ from sfm_shapefit.cli.flags import (
 )
 from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.command_options import LocateOptions
 
 _FLAGS = (
     *("control_points", "known_distance", "fix", "without", "rotations", "intrinsics", "rigs", "adjust"),

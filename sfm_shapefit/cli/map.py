@@ -21,8 +21,8 @@ from sfm_shapefit.cli.flags import (
 )
 from sfm_shapefit.cli.frame import Run, command_run
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.facts.options import MapOptions
-from sfm_shapefit.files.options import MatchingOptions
+from sfm_shapefit.facts.command_options import MapOptions
+from sfm_shapefit.files.matching_options import MatchingOptions
 
 _FLAGS = (
     *("control_points", "known_distance", "gravity", "without", "intrinsics", "rigs", "adjust", "scale"),

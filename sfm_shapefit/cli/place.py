@@ -8,7 +8,7 @@ import typer
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, flags_of, one_path, takes
 from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 
 
 @app.command("solve", cls=GroupedCommand, hidden=True, epilog="Example: sfm-shapefit place graph.txt out")

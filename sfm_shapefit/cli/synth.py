@@ -19,7 +19,7 @@ from sfm_shapefit.cli.flags import (
 )
 from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions, WorkspaceOptions
+from sfm_shapefit.synthetic.scene_options import RenderOptions, SceneOptions, WorkspaceOptions
 
 DrawImages = Annotated[
     bool, typer.Option("--images", help="Draw images, and let COLMAP find the keypoints and matches in them.")

@@ -12,7 +12,7 @@ from sfm_shapefit.base.display import Displayed, NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.model import CheckedFacts
-from sfm_shapefit.judgement.limits import FEW, HALF
+from sfm_shapefit.judgement.limits import LOCAL_SHARE, RIVAL_SHARE
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.sequences import find_sequences
@@ -89,7 +89,7 @@ def _choose_kept(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -
     taken = set[str]()
     for one in sorted(usable, key=lambda one: -images[one.folder].num_images):
         names = set(images[one.folder].names)
-        if len(names - taken) >= HALF * len(names):
+        if len(names - taken) >= RIVAL_SHARE * len(names):
             taken |= names
             yield one.folder
 
@@ -102,7 +102,7 @@ def _compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
     for rows, _ in find_sequences(names):
         members = np.unique(model[rows])
         typical = np.array([np.median(widths[rows][model[rows] == k]) for k in members])
-        if np.ptp(np.log(typical)) > FEW:
+        if np.ptp(np.log(typical)) > LOCAL_SHARE:
             least, most = (Path([*images][members[k]]).name for k in (typical.argmin(), typical.argmax()))
             yield (
                 f"one device, as {names[rows[0]]} and others say, has a focal length of {typical.min():.3g} "

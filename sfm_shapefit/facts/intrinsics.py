@@ -76,7 +76,6 @@ class CameraIntrinsics(Record):
         return self.focal_px / self.given_focal_px - 1.0
 
     def _distortion(self) -> str:
-        """Say how the distortion changed, if it did."""
         before, after = np.array(self.given_parameters), np.array(self.parameters)
         is_distortion = np.abs(after) < 10.0  # lengths in pixels are larger
         changed = is_distortion & (np.abs(after - before) > _UNCHANGED)

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.facts.joins import Joined
+from sfm_shapefit.facts.joins import JoinOutcome
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.rows import correlations_of, covariances_of
 from sfm_shapefit.facts.tables import CameraRow, Table
@@ -29,7 +29,7 @@ class JoinedGroup(NamedTuple):
     reconstruction: "pycolmap.Reconstruction"
     world_from: Mapping[int, Similarity]
     """By the number of each model, the first one's first."""
-    joins: Sequence[Joined]
+    joins: Sequence[JoinOutcome]
     tied: Sequence[tuple[str, str]] = ()
     """Images of models that are joined, which stand rightly to one another as far as the joins do."""
 

@@ -7,7 +7,7 @@ from sfm_shapefit.base.geometry import Alignment
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.placement.join import PieceJoin
-from sfm_shapefit.solver.options import Solve
+from sfm_shapefit.solver.solver_options import Solve
 
 
 class JoinFacts(Record):
@@ -38,7 +38,7 @@ class JoinFacts(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Joined:
+class JoinOutcome:
     """A model beside another, and what came of joining it to that."""
 
     model: int

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from sfm_shapefit.base.display import Row, Telling, Written, row
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted, reasons_by_place
-from sfm_shapefit.facts.joins import Joined
+from sfm_shapefit.facts.command_options import MapOptions
+from sfm_shapefit.facts.joins import JoinOutcome
 from sfm_shapefit.facts.model import (
     Component,
     DatabaseInputs,
@@ -22,7 +23,6 @@ from sfm_shapefit.facts.model import (
     MapFacts,
     next_of_model,
 )
-from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table, Tabled
 from sfm_shapefit.judgement.grade import FEW_PLACED, in_another_model
@@ -41,7 +41,7 @@ class JoinedModel(Written, Stated):
     reconstruction: "pycolmap.Reconstruction"
     models: tuple[int, ...]
     """Their numbers; the world is that of the first, scaled if known distances between them give a scale."""
-    joins: tuple[Joined, ...]
+    joins: tuple[JoinOutcome, ...]
     """What came of joining each model to another, those included that are not in this one."""
     cameras: Table[CameraRow]
     """One row per image of these models."""
@@ -91,7 +91,7 @@ class MapResult(Written, Tabled):
     left_out: dict[str, str]
     """Name and reason of each image in no model."""
     timings_s: dict[str, float]
-    joins: tuple[Joined, ...] = ()
+    joins: tuple[JoinOutcome, ...] = ()
     """What came of joining each model but the largest to a larger one."""
     joined: tuple[JoinedModel, ...] = ()
     """Models that were joined, in one world; each stands in `models` by itself too."""
@@ -179,7 +179,7 @@ class MapResult(Written, Tabled):
         """Names of all images of the models."""
         return tuple(name for model in self.models for name in model.image_names)
 
-    def folder_of_join(self, join: Joined) -> str | None:
+    def folder_of_join(self, join: JoinOutcome) -> str | None:
         """Return where the models of a join stand in one world; None if they were not joined."""
         return next((one.folder for one in self.joined if join.join and join.model in one.models), None)
 

@@ -9,7 +9,7 @@ from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.scene import describe_repeated_pairs, describe_rival_pairs
 from sfm_shapefit.judgement.reasons import Grade
-from sfm_shapefit.placement.options import KnownDistance
+from sfm_shapefit.placement.gauge_options import KnownDistance
 
 _ALARMING_SHARE = 0.7  # share of a model's agreeing pairs; below, warn (castle-P30: 0.97, lego100: 0.89)
 _DOUBTFUL_SHARE = 0.25  # share of an image's agreeing pairs; below, its averaged rotation is doubtful

@@ -25,7 +25,7 @@ from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.placement.place import Placement, count_large
 from sfm_shapefit.refinement.starts import RefinedPlacement
-from sfm_shapefit.solver.options import Solve, Status
+from sfm_shapefit.solver.solver_options import Solve, Status
 from sfm_shapefit.solver.splitting.lud import Lud
 
 UNITS = {

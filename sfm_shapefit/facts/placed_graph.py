@@ -10,7 +10,7 @@ from sfm_shapefit.facts.warnings import graph_warnings
 from sfm_shapefit.judgement.graph_grade import judge_graph
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import ModelVerdict
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

@@ -14,6 +14,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.display import Telling, Written, report_in_notebook
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted, reasons_by_place
+from sfm_shapefit.facts.command_options import PlacingOptions
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.joins import JoinFacts
@@ -24,7 +25,6 @@ from sfm_shapefit.facts.model import (
     PlacementAdjustment,
     RotationRefinement,
 )
-from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.placed import (
     IN_MEMORY,
     SOLVER_UNITS,
@@ -44,7 +44,7 @@ from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import Shares, judge_model, too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.judged import Judged
-from sfm_shapefit.judgement.limits import FEW
+from sfm_shapefit.judgement.limits import LOCAL_SHARE
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.support import EvidenceShares
@@ -52,15 +52,15 @@ from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.gauge import Gauge
-from sfm_shapefit.placement.options import KnownDistance
+from sfm_shapefit.placement.gauge_options import KnownDistance
 from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.placement.right_pairs import RightPairs, examine_right_pairs
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.sequences import Loop
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
-from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.solver.solver_options import SolverResult
 
 if TYPE_CHECKING:
     import pycolmap
@@ -122,8 +122,6 @@ class Inputs:
 
 
 class _Placed(Written, Tabled):
-    """A placed model or graph."""
-
     placement: Judged
 
     @property
@@ -329,7 +327,7 @@ class LocateResult(_Placed):
         """Yield that many position priors contradict the cameras: a few are wrong, many may be right."""
         if self.prior_fit is not None:
             wrong, count = len(self.prior_fit.wrong), int(np.isfinite(self.prior_fit.off).sum())
-            if wrong > max(1, FEW * count):
+            if wrong > max(1, LOCAL_SHARE * count):
                 clause = f"{wrong} of {counted(count, 'position prior')} contradict where cameras stand"
                 yield of_model(Kind.INPUT, clause)
 

@@ -11,7 +11,7 @@ from sfm_shapefit.rotations.sequences import Loop
 from sfm_shapefit.scene.images import Images
 
 if TYPE_CHECKING:
-    from sfm_shapefit.placement.options import KnownDistance
+    from sfm_shapefit.placement.gauge_options import KnownDistance
 
 
 class DistanceFacts(Record):

@@ -12,13 +12,13 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.wording import counted_are, first_of
 from sfm_shapefit.judgement.grade import largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
-from sfm_shapefit.judgement.limits import RARE
-from sfm_shapefit.judgement.options import TrustOptions
+from sfm_shapefit.judgement.limits import CHANCE_SHARE
 from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Kind, Reason, of_model
+from sfm_shapefit.judgement.trust_options import TrustOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_fit import PriorFit
-from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.solver.options import Status
+from sfm_shapefit.refinement.placement_options import PlacementOptions
+from sfm_shapefit.solver.solver_options import Status
 
 _ALARMING_SHARE = 0.5  # share of pairs against the solution, or the given rotations; above, warn
 _FEW_REJECTED = 0.1  # share of pairs against refined locations; below, a collapsed start does not matter
@@ -100,7 +100,7 @@ def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
         worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
         above_all = "above all " if len(uncertain) > 1 else ""
         yield (
-            f"{counted_are(len(uncertain), 'camera')} uncertain by more than {RARE:.0%} of the "
+            f"{counted_are(len(uncertain), 'camera')} uncertain by more than {CHANCE_SHARE:.0%} of the "
             f"extent, {above_all}{worst}; see sigma and trust in cameras.csv"
         )
 

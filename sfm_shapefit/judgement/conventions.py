@@ -88,7 +88,6 @@ def recognize_convention(
 
 
 def _in_other_conventions(rotations: FloatArray, written: PoseFile) -> Iterator[_Reading]:
-    """Yield what poses are if they are in another convention than the one they were read by."""
     is_transforms, into = written == "transforms", written != "model"  # are to be camera-to-world
     own = rotations.transpose(0, 2, 1) if into else rotations  # as the file has them
     order, *orders = _ORDERS["model" if is_transforms else written]

@@ -104,7 +104,6 @@ def _add_scores(
 
 @inner_kernel
 def _dot(a: Any, b: Any) -> float:
-    """Return the inner product of two vectors in space."""
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 

@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
-from sfm_shapefit.judgement.limits import MANY
+from sfm_shapefit.judgement.limits import MOST_AGAINST
 from sfm_shapefit.judgement.trust import LOW_TRUST, SOMEWHAT_LOOSE, USUAL_SHARE
 from sfm_shapefit.judgement.turns import Doubt, Doubts
 from sfm_shapefit.judgement.verdicts import Assessment
@@ -70,7 +70,7 @@ def _factors(doubts: Doubts) -> FloatArray:
     share = doubts.placed / np.maximum(doubts.placed + doubts.turned, 1e-300)
     by_kind = {
         Doubt.RIGHT: np.minimum(share / USUAL_SHARE, 1.0),
-        Doubt.AMBIGUOUS: np.full(len(share), 1.0 - MANY),
+        Doubt.AMBIGUOUS: np.full(len(share), 1.0 - MOST_AGAINST),
         Doubt.TURNED: share,
         Doubt.UNSUPPORTED: np.zeros(len(share)),
         Doubt.UNKNOWN: np.full(len(share), np.nan),

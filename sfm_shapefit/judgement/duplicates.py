@@ -16,11 +16,11 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.judgement.evidence import OddImages
-from sfm_shapefit.judgement.limits import FEW, FEWEST_POINTS, HALF, RARE
+from sfm_shapefit.judgement.limits import CHANCE_SHARE, FEWEST_POINTS, LOCAL_SHARE, RIVAL_SHARE
 from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.pairs.kernels import median, select_rank
 from sfm_shapefit.pairs.pair_directions import PairDirections
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import KeypointMatches, View, is_among
 from sfm_shapefit.scene.points import Points
 
@@ -28,7 +28,7 @@ from sfm_shapefit.scene.points import Points
 def find_split_duplicates(
     images: Images,
     points: Points,
-    pictures: Pictures,
+    pictures: KeypointRays,
     directions: PairDirections,
     view: View,
     threads: int = 1,
@@ -39,10 +39,10 @@ def find_split_duplicates(
     """
     pairs, counts, most = directions.pairs, directions.num_matches, np.zeros(images.num_images)
     np.maximum.at(most, pairs, counts[:, None])
-    asked = counts >= np.maximum(FEWEST_POINTS, HALF * most[pairs].max(axis=1))
+    asked = counts >= np.maximum(FEWEST_POINTS, RIVAL_SHARE * most[pairs].max(axis=1))
     apart = np.linalg.norm(images.centers[pairs[:, 0]] - images.centers[pairs[:, 1]], axis=1)
     apart /= _depths(images, points)[pairs].max(axis=1)
-    pairs, apart = pairs[asked & (apart > HALF)], apart[asked & (apart > HALF)]
+    pairs, apart = pairs[asked & (apart > RIVAL_SHARE)], apart[asked & (apart > RIVAL_SHARE)]
     found = _find_duplicates(images, pictures, pairs, view, threads)
     split, most = is_among(pairs, found), np.zeros_like(most)
     np.maximum.at(most, pairs[split], apart[split, None])
@@ -62,7 +62,7 @@ def _depths(images: Images, points: Points) -> FloatArray:
 
 
 def _find_duplicates(
-    images: Images, pictures: Pictures, pairs: IntArray, view: View, threads: int
+    images: Images, pictures: KeypointRays, pairs: IntArray, view: View, threads: int
 ) -> IntArray:
     """Return those of some pairs (k, 2) that are near duplicates."""
     found = [np.zeros((0, 2), dtype=np.int64)]
@@ -74,7 +74,7 @@ def _find_duplicates(
     return np.concatenate(found)
 
 
-def _places(images: Images, pictures: Pictures, batch: KeypointMatches, side: int) -> FloatArray:
+def _places(images: Images, pictures: KeypointRays, batch: KeypointMatches, side: int) -> FloatArray:
     """Return where the matches of pairs are in their first or second image, (M, 2), in its widths."""
     image_of = np.repeat(batch.pairs[:, side], np.diff(batch.offsets))
     order, (present, counts) = np.argsort(image_of, kind="stable"), np.unique(image_of, return_counts=True)
@@ -100,7 +100,7 @@ def _find_near(begin: int, end: int, offsets: Any, first: Any, second: Any, near
                     moved[k, c] = own[k, c] - second[offsets[p] + k, c]
                 middle[c] = median(work, count)
             spread = _reach(own, middle, count, work)
-            near[p] = _reach(moved, nowhere, count, work) <= RARE * 2.0 * spread
+            near[p] = _reach(moved, nowhere, count, work) <= CHANCE_SHARE * 2.0 * spread
 
 
 @inner_kernel
@@ -109,7 +109,7 @@ def _reach(places: Any, middle: Any, count: int, work: Any) -> float:
     for k in range(count):
         x, y = places[k, 0] - middle[0], places[k, 1] - middle[1]
         work[k] = np.sqrt(x * x + y * y)
-    place = (1.0 - FEW) * (count - 1)
+    place = (1.0 - LOCAL_SHARE) * (count - 1)
     rank = int(place)
     low = high = select_rank(work, count, rank)
     if rank + 1 < count:

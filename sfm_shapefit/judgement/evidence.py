@@ -10,7 +10,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import extent_of
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, stand
-from sfm_shapefit.judgement.limits import HALF, RARE
+from sfm_shapefit.judgement.limits import CHANCE_SHARE, RIVAL_SHARE
 from sfm_shapefit.judgement.places import AmbiguousPlace
 from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.seams import CameraGroup, GroupApart
@@ -70,7 +70,7 @@ class OpenShape(Record):
         covariances = np.zeros((images.num_images, 3, 3))
         covariances[rows] = left_open
         sigmas = standard_deviations(left_open).max(axis=1) / extent_of(images.centers[rows])
-        names = images.names_of(np.sort(rows[sigmas > RARE]))
+        names = images.names_of(np.sort(rows[sigmas > CHANCE_SHARE]))
         return cls(images=names, largest=float(sigmas.max()), covariances=covariances)
 
     @property
@@ -123,7 +123,7 @@ class ModelEvidence(Record):
             inside = frozenset(group.images)
             across = [pair for pair in contradicting if (pair[0] in inside) != (pair[1] in inside)]
             of_these = sum(not elsewhere.isdisjoint(pair) for pair in across)
-            is_cleared = second.grade is Grade.GOOD or of_these > HALF * len(across)
+            is_cleared = second.grade is Grade.GOOD or of_these > RIVAL_SHARE * len(across)
             return not (second.has_most_alike(group.images) and is_cleared)
 
         return replace(

@@ -17,7 +17,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.judgement.limits import ALIKE_DEG, FEWEST_ALIKE, RARE
+from sfm_shapefit.judgement.limits import ALIKE_DEG, CHANCE_SHARE, FEWEST_ALIKE
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.placement.conditioning import FEW_PAIRS
 
@@ -52,7 +52,7 @@ def held_by_chance(graph: ViewGraph, agrees: BoolArray, level_rad: float) -> Int
     """
     pairs = graph.degrees().astype(np.float64)
     others = 0.5 * pairs * (pairs - 1.0) - 1.0  # twos of pairs, but for one
-    is_likely = others * level_rad ** (graph.dimension - 2) > RARE
+    is_likely = others * level_rad ** (graph.dimension - 2) > CHANCE_SHARE
     by_chance = np.zeros(graph.num_nodes, dtype=np.bool_)
     while True:
         holding = graph.edges[agrees & ~by_chance[graph.edges].any(axis=1)]

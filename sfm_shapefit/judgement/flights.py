@@ -19,7 +19,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import INSIDE, distances_in_spreads
 from sfm_shapefit.judgement.evidence import OddImages
-from sfm_shapefit.judgement.limits import MANY, MOST_COMPARED, OUTNUMBERED, RARE, SIGMAS
+from sfm_shapefit.judgement.limits import CHANCE_SHARE, MOST_AGAINST, MOST_COMPARED, OUTNUMBERED, SIGMAS
 from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.sequences import find_sequences
@@ -44,7 +44,7 @@ def find_flights(images: Images) -> Iterator[OddImages]:
     leaps = np.zeros(len(posed))
     for rows, numbers in find_sequences(names):
         kept = ~flies[rows]
-        leaps[rows[kept]] = _leaps(centers[rows[kept]], numbers[kept], RARE * extent)
+        leaps[rows[kept]] = _leaps(centers[rows[kept]], numbers[kept], CHANCE_SHARE * extent)
     if (far := leaps > 0.0).any():
         sentence = "a place {} % of the extent away from the images before and after it"
         shares = 100.0 * leaps[far] / extent
@@ -55,7 +55,7 @@ def _flying(spreads: FloatArray) -> BoolArray:
     """Return which cameras (n,), at some distances in spreads, fly off."""
     order = np.sort(spreads)
     gaps = np.flatnonzero((order[1:] > INSIDE) & (order[1:] > SIGMAS * order[:-1])) + 1
-    gaps = gaps[gaps >= (1.0 - MANY) * len(spreads)]  # what is left behind is the rest
+    gaps = gaps[gaps >= (1.0 - MOST_AGAINST) * len(spreads)]  # what is left behind is the rest
     return spreads >= order[gaps[0]] if len(gaps) else np.zeros(len(spreads), dtype=np.bool_)
 
 

@@ -49,10 +49,10 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.judgement.evidence import ModelEvidence, how_far
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import (
-    FEW,
-    HALF,
-    MANY,
-    RARE,
+    CHANCE_SHARE,
+    LOCAL_SHARE,
+    MOST_AGAINST,
+    RIVAL_SHARE,
     SMALLEST_SHAPE,
 )
 from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each, of_model
@@ -61,7 +61,7 @@ from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
 
-FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to be looked at
+FEW_PLACED = 1.0 - CHANCE_SHARE  # share of images in the output; below, the model is to be looked at
 
 
 class Shares(NamedTuple):
@@ -86,15 +86,19 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
 
     if apart:
         clause = clause.format(f"{len(apart)} of {counted(count, 'camera')}")
-        grade = Grade.DO_NOT_USE if len(_without(apart, second.confirmed)) > FEW * count else Grade.LOOK
+        grade = (
+            Grade.DO_NOT_USE if len(_without(apart, second.confirmed)) > LOCAL_SHARE * count else Grade.LOOK
+        )
         yield of_model(Kind.APART, clause, grade, apart)
     held = evidence.num_held
-    if held is not None and (held < HALF * count or held < SMALLEST_PIECE <= count):  # any pair holds two
+    if held is not None and (
+        held < RIVAL_SHARE * count or held < SMALLEST_PIECE <= count
+    ):  # any pair holds two
         clause = f"the pairs that agree hold only {held} of {counted(count, 'camera')}"
         yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
     else:
         yield from _too_few_agree(evidence, images)
-    if len(named - second.confirmed) > MANY * count and len(named) > len(apart):
+    if len(named - second.confirmed) > MOST_AGAINST * count and len(named) > len(apart):
         clause = f"evidence speaks against {len(named)} of {counted(count, 'camera')}"
         yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
     elsewhere = "it stands elsewhere in the model that map made of the same matches"
@@ -133,7 +137,7 @@ def _too_few_agree(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     """
     agreeing, against = evidence.sides
     joining = 0 < agreeing < len(np.unique(images.frame_of[images.is_posed]))
-    if joining and against >= HALF * agreeing:
+    if joining and against >= RIVAL_SHARE * agreeing:
         clause = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
         clause = f"{clause}, and only {agreeing} agree{'s' * (agreeing == 1)}, too few to check it"
         yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE if against >= agreeing else Grade.LOOK)
@@ -141,7 +145,7 @@ def _too_few_agree(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
 
 def _weigh_oddities(evidence: ModelEvidence, num_posed: int) -> Iterator[Reason]:
     """Yield which lenses and places hardly can be: few images each by itself, more as one."""
-    few = max(FEW * num_posed, 1)
+    few = max(LOCAL_SHARE * num_posed, 1)
     are_many = sum(len(one.images) for one in evidence.odd if one.cannot_be) > few
     for one in sorted(evidence.odd, key=lambda one: -len(one.images)):
         number = len(one.images)
@@ -206,7 +210,7 @@ def _doubtful_cameras(placement: Judged) -> Iterator[Reason]:
         adjusted = placement.adjusted_covariances
         if adjusted is None or np.isnan(adjusted[group.cameras]).any():
             found |= dict.fromkeys(group.cameras.tolist(), (Kind.UNCERTAIN, str(group.cause.value)))
-    uncertain = Kind.UNCERTAIN, f"it is uncertain by more than {RARE:.0%} of the extent"
+    uncertain = Kind.UNCERTAIN, f"it is uncertain by more than {CHANCE_SHARE:.0%} of the extent"
     found |= dict.fromkeys(uncertain_cameras(placement).tolist(), uncertain)
     low = np.flatnonzero(trust < LOW_TRUST).tolist()
     found |= {k: (Kind.TRUST, reasons[k] or "pairs speak against it") for k in low}
@@ -222,11 +226,11 @@ def in_another_model(here: float) -> Reason:
 
 def _weigh_shares(shares: Shares) -> Iterator[Reason]:
     """Yield what too small or too large a share says against a model; one that is not known says nothing."""
-    if shares.contradicting >= HALF:
+    if shares.contradicting >= RIVAL_SHARE:
         clause = f"{shares.contradicting:.0%} of the observations contradict the cameras"
         yield of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE)
     if shares.placed < FEW_PLACED:
-        grade = Grade.DO_NOT_USE if shares.placed < HALF else Grade.LOOK
+        grade = Grade.DO_NOT_USE if shares.placed < RIVAL_SHARE else Grade.LOOK
         yield of_model(Kind.LEFT_OUT, f"only {shares.placed:.0%} of the images are placed", grade)
     elif shares.placed_here < FEW_PLACED:
         yield in_another_model(shares.placed_here)
@@ -236,7 +240,7 @@ def uncertain_cameras(placement: Judged) -> IntArray:
     """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
     if len(placement.cameras) < SMALLEST_PIECE:
         return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(sigmas_of_extent(placement) > RARE)
+    return np.flatnonzero(sigmas_of_extent(placement) > CHANCE_SHARE)
 
 
 def sigmas_of_extent(placement: Judged) -> FloatArray:

@@ -23,7 +23,14 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.judgement.few_ties import FewTies, barely_held, find_few_ties
 from sfm_shapefit.judgement.grade import Shares, judge_model, sigmas_of_extent
 from sfm_shapefit.judgement.judged import Judged
-from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, RARE, SURE_SIGMAS
+from sfm_shapefit.judgement.limits import (
+    CHANCE_SHARE,
+    KNOWN_DEG,
+    LOCAL_SHARE,
+    MOST_AGAINST,
+    RIVAL_SHARE,
+    SURE_SIGMAS,
+)
 from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.verdicts import Verdict
 
@@ -39,9 +46,11 @@ def judge_graph(placement: Judged) -> ModelVerdict:
     if level > _MOST_LEVEL_DEG:
         clause = f"the directions are {level:.0f} degrees off the cameras"
         reasons.append(of_model(Kind.PAIRS, clause, Grade.DO_NOT_USE))
-    elif np.mean(shares > FEW) > HALF or (np.mean(shares > RARE) > FEW and np.mean(is_barely_held) > MANY):
-        some = f"{np.sum(shares > RARE)} of {counted(count, 'camera')}"
-        clause = f"the pairs that agree leave {some} uncertain by more than {RARE:.0%} of the extent"
+    elif np.mean(shares > LOCAL_SHARE) > RIVAL_SHARE or (
+        np.mean(shares > CHANCE_SHARE) > LOCAL_SHARE and np.mean(is_barely_held) > MOST_AGAINST
+    ):
+        some = f"{np.sum(shares > CHANCE_SHARE)} of {counted(count, 'camera')}"
+        clause = f"the pairs that agree leave {some} uncertain by more than {CHANCE_SHARE:.0%} of the extent"
         reasons.append(of_model(Kind.UNCERTAIN, clause, Grade.DO_NOT_USE))
     if all(assessment.verdict(k) is Verdict.UNDETERMINED for k in placement.pairs.tolist()):
         reasons.append(of_model(Kind.UNCHECKED, "no pair is checked by others", Grade.CANNOT_BE_JUDGED))

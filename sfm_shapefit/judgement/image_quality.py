@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_each
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 
@@ -40,7 +40,7 @@ class ImageQuality:
     """(x,) number of images that observe each point."""
 
 
-def image_quality(points: Points, images: Images, pictures: Pictures) -> ImageQuality:
+def image_quality(points: Points, images: Images, pictures: KeypointRays) -> ImageQuality:
     """Return how well each of posed images is held by the points that they observe."""
     misses_px = keypoint_errors_px(points, images, pictures, ahead=False)
     n, lengths, seen = images.num_images, points.lengths(), points.points_seen()

@@ -17,7 +17,7 @@ from sfm_shapefit.placement.second_configuration import (
     find_rival,
     find_second_configuration,
 )
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.lens import LensErrors
 
 

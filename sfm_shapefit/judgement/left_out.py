@@ -28,7 +28,7 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.losses import CAUCHY, weighed
 from sfm_shapefit.judgement.limits import FEWEST_POINTS, FITTING_PX
 from sfm_shapefit.pairs.kernels import fill_basis, median
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.lens import LARGEST_SIGMA
 from sfm_shapefit.scene.points import Points
 
@@ -74,7 +74,7 @@ class LeftOut:
 def leave_one_out(
     points: Points,
     images: Images,
-    pictures: Pictures,
+    pictures: KeypointRays,
     threads: int = 1,
     believed: BoolArray | None = None,
     asked: BoolArray | None = None,
@@ -111,7 +111,7 @@ def leave_one_out(
     return LeftOut(counts, *figures.T)
 
 
-def _look(points: Points, images: Images, pictures: Pictures) -> tuple[Points, FloatArray, FloatArray]:
+def _look(points: Points, images: Images, pictures: KeypointRays) -> tuple[Points, FloatArray, FloatArray]:
     """Return the points with the observations that have a ray, these (o, 3), and their places.
 
     Rays are of length 1 and in camera axes; a place (o, 2) is that in a picture of focal length 1.

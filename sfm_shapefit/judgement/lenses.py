@@ -31,9 +31,9 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.evidence import OddImages
-from sfm_shapefit.judgement.limits import FEW, FITTING_PX, HALF, SMALLEST_SHAPE, SURE_SIGMAS
+from sfm_shapefit.judgement.limits import FITTING_PX, LOCAL_SHARE, RIVAL_SHARE, SMALLEST_SHAPE, SURE_SIGMAS
 from sfm_shapefit.judgement.reasons import Kind
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.scene.sequences import find_sequences
@@ -72,7 +72,7 @@ class LensShape(NamedTuple):
         faults = {
             "pixels finer than the air lets any camera see": (lens.focal_px > _FINEST_PX, True),
             f"a straight picture {self.view_deg:.0f} degrees wide, which no lens makes": (
-                self.view_deg >= _WIDEST_DEG and least > HALF,
+                self.view_deg >= _WIDEST_DEG and least > RIVAL_SHARE,
                 True,
             ),
             "a distortion that turns back inside the picture": (self.folds, True),
@@ -90,7 +90,7 @@ class LensShape(NamedTuple):
             ),
             "a principal point outside the picture": (is_outside, False),
             "parameters for which COLMAP's mapper drops images": (
-                is_bogus and abs(longer - 1.0) > FEW and is_long,
+                is_bogus and abs(longer - 1.0) > LOCAL_SHARE and is_long,
                 False,
             ),
         }
@@ -137,7 +137,7 @@ def _middle(lens: Lens) -> FloatArray:
 
 
 def find_odd_lenses(
-    images: Images, points: Points, pictures: Pictures, bogus: BoolArray
+    images: Images, points: Points, pictures: KeypointRays, bogus: BoolArray
 ) -> Iterator[OddImages]:
     """Yield the posed images whose lenses cannot be, or hardly, together by what is wrong about them.
 
@@ -168,7 +168,7 @@ def find_odd_lenses(
             logs = np.log([own, images.focal_lengths_px[cameras]])
             if not any(map(_return_to_few, logs)):
                 logs = np.abs(logs - np.median(logs, axis=1, keepdims=True))
-                far, usual = logs.min(axis=0) > FEW, np.median(own)
+                far, usual = logs.min(axis=0) > LOCAL_SHARE, np.median(own)
                 sentence = "a lens unlike others of one device, as names say: focal length {} picture widths"
                 sentence = f"{sentence}, where {usual:.3g} is usual"
                 if far.any():
@@ -178,16 +178,16 @@ def find_odd_lenses(
 def _return_to_few(logs: FloatArray) -> bool:
     """Return whether half of some logarithms are of one value, or nearly all of few; see the header."""
     ordered = np.sort(logs)
-    groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > FEW) + 1)
+    groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > LOCAL_SHARE) + 1)
     middles = [np.median(group) for group in groups]
     away = np.diff(middles, prepend=-np.inf, append=np.inf)
-    most = np.minimum(FEW, np.minimum(away[:-1], away[1:]) / SURE_SIGMAS)
+    most = np.minimum(LOCAL_SHARE, np.minimum(away[:-1], away[1:]) / SURE_SIGMAS)
     tight = [
         len(group)
         for group, limit in zip(groups, most.tolist(), strict=True)
         if len(group) >= SMALLEST_SHAPE and _scatter(group) <= limit
     ]
-    return _scatter(logs) <= FEW or sum(tight) >= (1.0 - FEW) * len(logs)
+    return _scatter(logs) <= LOCAL_SHARE or sum(tight) >= (1.0 - LOCAL_SHARE) * len(logs)
 
 
 def _scatter(logs: FloatArray) -> float:
@@ -195,7 +195,7 @@ def _scatter(logs: FloatArray) -> float:
     return SIGMA_PER_MEDIAN * float(np.median(np.abs(logs - np.median(logs))))
 
 
-def _reaches(images: Images, points: Points, pictures: Pictures) -> FloatArray:
+def _reaches(images: Images, points: Points, pictures: KeypointRays) -> FloatArray:
     """Return how far from the principal point of each lens its points reach, (l,) in pixels, or NaN."""
     far: list[list[FloatArray]] = [[np.zeros(0)] for _ in images.lenses]
     for k, rows in enumerate(points.rows_of_images(images.num_images)):

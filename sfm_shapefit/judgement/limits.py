@@ -6,13 +6,13 @@ A statement of chance stands behind each: what sound pairs, points and cameras h
 OUTNUMBERED = 2.0
 """Ratio of pairs, points, residuals or shares for one of two explanations to those for the other; one that
 has twice as many is believed."""
-HALF = 1.0 / OUTNUMBERED
+RIVAL_SHARE = 1.0 / OUTNUMBERED
 """Share of those for the other explanation that one needs at least to be its rival."""
-MANY = 1.0 / (1.0 + OUTNUMBERED)
+MOST_AGAINST = 1.0 / (1.0 + OUTNUMBERED)
 """Share of the pairs of a camera, or of the cameras, that may contradict; the rest outnumbers no more."""
-FEW = 0.1
+LOCAL_SHARE = 0.1
 """Share of cameras, of pairs, or of the spread of the scene; less is local and leaves the whole as it is."""
-RARE = 0.05
+CHANCE_SHARE = 0.05
 """Share of sound pairs or cameras that are off by chance. Also the largest error of a sound camera, as a
 share of the extent."""
 SIGMAS = 3.0
@@ -23,7 +23,7 @@ KNOWN_DEG = 1.0
 """Degrees, standard deviation of the direction and of the turn of a pair by itself; few know theirs worse."""
 ALIKE_DEG = SIGMAS * KNOWN_DEG
 """Degrees between turns, or to a place, of pairs that say the same."""
-NEAR_DEG = HALF * KNOWN_DEG
+NEAR_DEG = RIVAL_SHARE * KNOWN_DEG
 """Degrees; what is nearer is no other place, and no other turn."""
 FEWEST_ALIKE = 3
 """Pairs that say the same; two say the same of something by chance."""

@@ -20,7 +20,7 @@ from sfm_shapefit.judgement.limits import (
     FEWEST_ALIKE,
     FEWEST_POINTS,
     KNOWN_DEG,
-    MANY,
+    MOST_AGAINST,
     OUTNUMBERED,
     SIGMAS,
     SURE_SIGMAS,
@@ -70,7 +70,7 @@ class PairFits:
         shares = against / np.maximum(total, 1)
         asked = total > 0
         usual = float(np.median(shares[asked])) if asked.any() else 0.0
-        many = asked & (shares > max(MANY, OUTNUMBERED * usual))
+        many = asked & (shares > max(MOST_AGAINST, OUTNUMBERED * usual))
         lost = np.bincount(ends[self.contradicts & (ends[:, 0] != ends[:, 1])].ravel(), minlength=count)
         for counts in (total, against):
             counts[~asked] = lost[~asked]

@@ -22,7 +22,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.judgement.limits import ALIKE_DEG, FEWEST_ALIKE, HALF, NEAR_DEG, SIGMAS
+from sfm_shapefit.judgement.limits import ALIKE_DEG, FEWEST_ALIKE, NEAR_DEG, RIVAL_SHARE, SIGMAS
 
 _MOST_RAYS = 30  # rejected rays of a camera that define places, evenly taken; all of them count
 
@@ -85,7 +85,7 @@ def find_other_places(
     found = []
     for camera, own in zip(cameras.tolist(), np.split(rows[order], begins[1:]), strict=True):
         num_right = int(agrees[own].sum())
-        if len(own) - num_right < max(FEWEST_ALIKE, HALF * (1.0 - HALF) * num_right):
+        if len(own) - num_right < max(FEWEST_ALIKE, RIVAL_SHARE * (1.0 - RIVAL_SHARE) * num_right):
             continue  # even if all that are wrong met in one place
         signs = np.where(pairs[own, 0] == camera, 1.0, -1.0)[:, None]
         others = np.where(pairs[own, 0] == camera, pairs[own, 1], pairs[own, 0])
@@ -94,8 +94,8 @@ def find_other_places(
         there, place = wrong.best_place(near_deg)
         both = right.pass_at(place[None], near_deg)[0]
         agreeing, shared = len(both), int(both.sum())
-        is_enough = there >= max(FEWEST_ALIKE, HALF * (agreeing - shared))
-        if is_enough and shared <= HALF * agreeing:
+        is_enough = there >= max(FEWEST_ALIKE, RIVAL_SHARE * (agreeing - shared))
+        if is_enough and shared <= RIVAL_SHARE * agreeing:
             here = tuple((names[i], names[j]) for i, j in pairs[own[agrees[own]][~both]].tolist())
             found.append(
                 AmbiguousPlace(

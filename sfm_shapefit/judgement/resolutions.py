@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.judgement.conventions import Recognized
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.points import Points
 
 _GROSS_PX = 2.0  # median reprojection error in pixels; smaller ones are no matter of the resolution
@@ -33,7 +33,7 @@ def recognize_sizes(sizes_px: FloatArray, database_px: FloatArray) -> Recognized
     )
 
 
-def recognize_resolution(points: Points, images: Images, pictures: Pictures) -> Recognized | None:
+def recognize_resolution(points: Points, images: Images, pictures: KeypointRays) -> Recognized | None:
     """Return by what factors observations are scaled; None if by none that explains their errors."""
     seen, rows_of, found = points.points_seen(), points.rows_of_images(images.num_images), []
     for k in range(0, images.num_images, -(-images.num_images // _MOST_IMAGES)):

@@ -27,7 +27,7 @@ from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.bodies import find_bodies
-from sfm_shapefit.judgement.limits import ALIKE_DEG, FEW, FEWEST_ALIKE, MOST_COMPARED, OUTNUMBERED
+from sfm_shapefit.judgement.limits import ALIKE_DEG, FEWEST_ALIKE, LOCAL_SHARE, MOST_COMPARED, OUTNUMBERED
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import is_among
@@ -114,7 +114,7 @@ def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, images: Image
         rows = rows[np.arange(taken) * len(rows) // max(taken, 1)]
         turns = _turns(sound.subset(rows), images.rotations, cut.cameras)
         num_turned, turn_deg = _most_alike(turns)
-        is_turned = num_turned >= FEWEST_ALIKE and num_turned > FEW * len(rows)
+        is_turned = num_turned >= FEWEST_ALIKE and num_turned > LOCAL_SHARE * len(rows)
         if (is_turned and turn_deg > ALIKE_DEG) or not cut.is_tied:
             seams.append(
                 GroupApart(

@@ -27,11 +27,11 @@ from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, medi
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded, stand
 from sfm_shapefit.judgement.limits import (
-    FEW,
     FEWEST_ALIKE,
-    HALF,
+    LOCAL_SHARE,
     NEAR_DEG,
     OUTNUMBERED,
+    RIVAL_SHARE,
     SMALLEST_SHAPE,
     SURE_SIGMAS,
 )
@@ -70,7 +70,7 @@ class SecondOpinion(Record):
 
     def __post_init__(self) -> None:
         is_silent = not (self.wrong or self.undecided or self.ambiguous)
-        object.__setattr__(self, "has_nothing_in_common", self.usual > FEW and is_silent)
+        object.__setattr__(self, "has_nothing_in_common", self.usual > LOCAL_SHARE and is_silent)
 
     @property
     def alike(self) -> frozenset[str]:
@@ -79,7 +79,7 @@ class SecondOpinion(Record):
 
     def has_most_alike(self, images: Sequence[str]) -> bool:
         """Return whether half or more of some images stand where they do in the other model."""
-        return len(self.alike.intersection(images)) >= HALF * len(images)
+        return len(self.alike.intersection(images)) >= RIVAL_SHARE * len(images)
 
     @property
     def is_alike(self) -> bool:
@@ -155,8 +155,6 @@ def compare_models(
 
 
 class _Residuals(NamedTuple):
-    """Residuals of pairs of common cameras."""
-
     keys: IntArray
     """(m,) i * k + j of cameras i < j of k common ones; ascending."""
     degrees: FloatArray

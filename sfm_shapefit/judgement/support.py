@@ -8,7 +8,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.judgement.limits import CHECKED_BY, FEWEST_POINTS, OUTNUMBERED, RARE, SMALLEST_SHAPE
+from sfm_shapefit.judgement.limits import CHANCE_SHARE, CHECKED_BY, FEWEST_POINTS, OUTNUMBERED, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.joining import sampson_px, write_ray
@@ -147,7 +147,9 @@ def images_without_support(counts: ObservationCounts, images: Images, fixed: Boo
     asked.
     """
     could = counts.checked >= OUTNUMBERED * FEWEST_POINTS
-    does = could & (counts.agreeing >= RARE * counts.checked)  # right images have .26 or more, a wrong one 0
+    does = could & (
+        counts.agreeing >= CHANCE_SHARE * counts.checked
+    )  # right images have .26 or more, a wrong one 0
     posed, lost, support = np.zeros((3, len(images.frames.ids)), dtype=np.bool_)
     posed[images.frame_of[images.is_posed]] = True
     lost[images.frame_of[could]], support[images.frame_of[does]] = True, True

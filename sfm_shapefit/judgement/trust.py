@@ -22,7 +22,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.graph.measured import MeasuredGraph
-from sfm_shapefit.judgement.limits import FEW
+from sfm_shapefit.judgement.limits import LOCAL_SHARE
 from sfm_shapefit.placement.conditioning import FEW_PAIRS, Conditioning, Looseness
 
 USUAL_SHARE = 0.75
@@ -99,14 +99,13 @@ def _shares(measured: MeasuredGraph, agrees: BoolArray) -> FloatArray:
 
 def _hold(centers: FloatArray, largest_sigmas: FloatArray) -> FloatArray:
     """Return tau^2 / (tau^2 + sigma^2) of each camera, 1 where sigma is not known."""
-    tau = FEW * median_spread(centers)
+    tau = LOCAL_SHARE * median_spread(centers)
     if not tau > 0.0:
         return np.where(np.isinf(largest_sigmas), 0.0, 1.0)
     return np.asarray(1.0 / (1.0 + (np.nan_to_num(largest_sigmas, nan=0.0, posinf=np.inf) / tau) ** 2))
 
 
 def _loose_reason(cause: Looseness | None, few: bool) -> str:
-    """Say what leaves a camera loose, or nothing."""
     if cause is not None:
         return str(cause.value)
     return str(Looseness.FEW_PAIRS.value) if few else ""

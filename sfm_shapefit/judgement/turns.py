@@ -47,7 +47,14 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
 from sfm_shapefit.base.geometry import nearest_rotations, rotation_angles_deg
 from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
 from sfm_shapefit.judgement.bodies import find_bodies
-from sfm_shapefit.judgement.limits import ALIKE_DEG, HALF, KNOWN_DEG, MANY, MOST_COMPARED, RARE
+from sfm_shapefit.judgement.limits import (
+    ALIKE_DEG,
+    CHANCE_SHARE,
+    KNOWN_DEG,
+    MOST_AGAINST,
+    MOST_COMPARED,
+    RIVAL_SHARE,
+)
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import LAST_WIDTH_PX
@@ -60,7 +67,10 @@ _LEAST_TURN_RAD = np.radians(KNOWN_DEG)  # radians; a turn below this and ...
 _AGREEING_SIGMAS = 3.5  # ... below this, in standard deviations of the least certain axis: counts as none
 _LARGEST_SIGMA_RAD = np.radians(ALIKE_DEG)  # radians; agreement says nothing where more is as likely
 _LEVEL_QUANTILE, _NORMAL_QUANTILE = 0.25, 1.1  # quantile of errors, and its value for normal ones; see above
-_UNEXPLAINED, _EXPLAINED = 0.7, 1.0 - RARE  # ratios of weights; given rotations fit not at all, and fully
+_UNEXPLAINED, _EXPLAINED = (
+    0.7,
+    1.0 - CHANCE_SHARE,
+)  # ratios of weights; given rotations fit not at all, and fully
 _MEAN_OF_MEDIAN = 0.8  # median residual of a robust fit over that of all matches; converts the second
 RIGHT_SHARE = 0.6
 """Share s; from here on a camera is right, below half of it turned."""
@@ -169,14 +179,14 @@ def weigh_pairs(
     usable = is_usable(directions.status)
     # A pair whose matches are as far off as it would turn, along its baseline, takes parallax for a turn.
     parallax = np.radians(np.nan_to_num(directions.parallax_deg))
-    sigmas[(np.nan_to_num(agreements) == 1.0) & (_angles(turns) > (1.0 - MANY) * parallax)] = np.inf
+    sigmas[(np.nan_to_num(agreements) == 1.0) & (_angles(turns) > (1.0 - MOST_AGAINST) * parallax)] = np.inf
     small = _angles(turns) <= np.maximum(_AGREEING_SIGMAS * sigmas, _LEAST_TURN_RAD)
     finite = np.isfinite(sigmas)
     judged = usable & np.isfinite(agreements)
     support = np.where(judged, np.nan_to_num(agreements) * explained, 0.0)
     asked = np.zeros(k, dtype=np.bool_)
     asked[row] = True
-    support = np.where(asked & ~(finite & small), HALF * support, support)
+    support = np.where(asked & ~(finite & small), RIVAL_SHARE * support, support)
     # A pair without a direction that could be compared speaks for the rotation all the same.
     support = np.where(~judged & finite & small & (sigmas <= _LARGEST_SIGMA_RAD), explained, support)
     weights = np.minimum(directions.num_matches.astype(np.float64), _MOST_WEIGHT)
@@ -222,7 +232,7 @@ class _Judged(NamedTuple):
     def kind(self) -> Doubt:
         """The verdict."""
         share = self.placed / max(self.placed + self.turned, 1e-300)
-        if share < HALF * RIGHT_SHARE and self.num_turned > 1:
+        if share < RIVAL_SHARE * RIGHT_SHARE and self.num_turned > 1:
             return Doubt.TURNED
         if self.placed <= 0.0:
             return Doubt.UNSUPPORTED if self.is_alone and self.num_pairs else Doubt.UNKNOWN

@@ -41,7 +41,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import distances_in_spreads, median_spread
 from sfm_shapefit.graph.groups import RigidGroups
-from sfm_shapefit.judgement.limits import FEW
+from sfm_shapefit.judgement.limits import LOCAL_SHARE
 from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES, Factor, FactorPlan, analyze, factorize
 from sfm_shapefit.laplacian.selected import SelectedInverse, regauged
 from sfm_shapefit.solver.program import adjoint, differences
@@ -268,7 +268,7 @@ def _fix_gauge(
         covariances = regauged(inverse.nodes, factor.solve, *_gauge_pair(locations, gauge))
         sizes = np.sqrt(np.maximum(np.trace(covariances, axis1=1, axis2=2), 0.0))
         largest = float(sizes[gauge].max())
-        if largest <= FEW * median_spread(locations[gauge]):
+        if largest <= LOCAL_SHARE * median_spread(locations[gauge]):
             break
         kept = gauge & (sizes < 0.5 * largest)
         if np.sum(kept) < least:

@@ -182,8 +182,6 @@ def find_hold(
 
 
 class _Sampled(NamedTuple):
-    """Samples of the errors of the directions."""
-
     errors: FloatArray
     """(m, s, d - 1) that sharing keypoints explains, in tangent bases, radians."""
     excess: FloatArray

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.judgement.limits import CHECKED_BY, FEWEST_POINTS, FITTING_PX, OUTNUMBERED
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
@@ -23,7 +23,7 @@ from sfm_shapefit.tracks.filter import keypoint_errors_px
 def are_confirmed(
     points: Points,
     images: Images,
-    pictures: Pictures,
+    pictures: KeypointRays,
     doubted: BoolArray,
     matches: tuple[IntArray, Sequence[KeypointMatches]],
 ) -> BoolArray:

@@ -22,8 +22,8 @@ from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import label_lens
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
-from sfm_shapefit.judgement.limits import HALF, OUTNUMBERED, SIGMAS, SMALLEST_SHAPE
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.judgement.limits import OUTNUMBERED, RIVAL_SHARE, SIGMAS, SMALLEST_SHAPE
+from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE, Lens
 from sfm_shapefit.scene.points import Points
 
@@ -133,7 +133,7 @@ def _ask_for_like(left_out: LeftOut, images: Images, lens: int, rows: IntArray) 
 def question_lenses(
     points: Points,
     images: Images,
-    pictures: Pictures,
+    pictures: KeypointRays,
     threads: int = 1,
     among: BoolArray | None = None,
     asked: BoolArray | None = None,
@@ -152,7 +152,7 @@ def question_lenses(
         left_out = found.of_little_noise(make)
         wrong = wrong_lenses(left_out, images)
         fresh = [item for item in wrong if believed[images.camera_ids == item.camera].any()]
-        worst = [item.camera for item in fresh if item.score >= HALF * fresh[0].score]
+        worst = [item.camera for item in fresh if item.score >= RIVAL_SHARE * fresh[0].score]
         gone = np.isin(images.camera_ids, worst)
         if not fresh or 2 * np.sum(make & (~believed | gone)) >= np.sum(make):
             return left_out, wrong

@@ -140,7 +140,6 @@ class CholeskyFactor:
         return self._factor(self._input(np.ascontiguousarray(weights)))
 
     def _input(self, weights: FloatArray) -> _Input:
-        """Return what fronts are assembled from."""
         plan, b = self.plan, self.block
         return _Input(
             b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, plan.relative,

@@ -86,8 +86,6 @@ def selected_inverse(
 
 
 class _Plan(NamedTuple):
-    """What the kernels need of the plan."""
-
     b: int
     first: IntArray
     row_pointers: IntArray

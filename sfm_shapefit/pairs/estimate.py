@@ -7,8 +7,8 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, frozen
 from sfm_shapefit.base.executors import in_ranges
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.kernels import MEASURES, MIN_MATCHES, estimate_pairs
-from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, first_reasons, is_usable
 from sfm_shapefit.scene.matches import RayMatches
 

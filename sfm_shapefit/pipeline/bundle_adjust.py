@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import FrameCovariances, estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import noise_px_of
 from sfm_shapefit.adjustment.lengths import estimate_lengths
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.run import begin, solve_known_points
 from sfm_shapefit.adjustment.solve import Adjusted, adjust
@@ -22,12 +22,12 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays
-from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
+from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
 from sfm_shapefit.files.colmap.reconstructions import arrays_of, moved_reconstruction
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import ObservedTracks
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 
 _WITHIN_95 = 1.96  # standard deviations; between them on either side lie 95 % of a normal distribution
@@ -190,5 +190,5 @@ def read_bundle(model: ModelArrays) -> tuple[Images, Points, ObservedTracks]:
     return (
         images,
         points,
-        collect_tracks(images, ModelPictures(images, points2d_of(model, images)), points),
+        collect_tracks(images, ModelKeypoints(images, points2d_of(model, images)), points),
     )

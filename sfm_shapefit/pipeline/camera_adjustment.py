@@ -19,8 +19,8 @@ from sfm_shapefit.base.geometry import normalized, tangent_bases, turned_deg
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.estimate import estimate_directions
-from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.state import ModelState

@@ -15,15 +15,15 @@ from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.wording import counted
+from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
-from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import UnposedImages, read_images
 from sfm_shapefit.files.colmap.database_pairs import refuse_no_features
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
-from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.inputs import choose_intrinsics, inputs_from, read_left_out
@@ -32,8 +32,8 @@ from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
 from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.averaging_options import AveragingOptions
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
-from sfm_shapefit.rotations.options import AveragingOptions
 from sfm_shapefit.rotations.sequences import Loop, Videos, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.scene.given import Gravity, Known
 from sfm_shapefit.scene.images import Images

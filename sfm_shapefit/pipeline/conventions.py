@@ -11,7 +11,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.database import DatabaseMatches
-from sfm_shapefit.files.colmap.points import ModelPictures
+from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.conventions import PoseFile, Recognized, recognize_convention
 from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Grade, Kind, of_model
@@ -31,7 +31,7 @@ def ask_resolution(source: MatchSource) -> Recognized | None:
     if isinstance(matches, DatabaseMatches):
         return recognize_sizes(source.images.sizes_px, matches.sizes_px())
     if isinstance(matches, TrackMatches):
-        pictures = ModelPictures(view.images, view.keypoints, view.num_keypoints)
+        pictures = ModelKeypoints(view.images, view.keypoints, view.num_keypoints)
         return recognize_resolution(matches.points_of(view.images), view.images, pictures)
     return None
 

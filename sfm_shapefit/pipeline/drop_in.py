@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
-from sfm_shapefit.facts.options import MapOptions
+from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pipeline.components import start_run

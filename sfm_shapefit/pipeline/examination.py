@@ -13,12 +13,12 @@ from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.lenses import is_bogus
-from sfm_shapefit.files.colmap.points import ModelPictures
+from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
 from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape
 from sfm_shapefit.judgement.flights import find_flights
 from sfm_shapefit.judgement.lenses import find_odd_lenses
-from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED, RARE, SMALLEST_SHAPE
+from sfm_shapefit.judgement.limits import CHANCE_SHARE, FITTING_PX, OUTNUMBERED, SMALLEST_SHAPE
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
 from sfm_shapefit.judgement.seams import GroupApart, find_cuts, find_seams
 from sfm_shapefit.judgement.ties import (
@@ -100,7 +100,7 @@ def question(state: ModelState, clock: Clock) -> ModelEvidence:
         images = with_left_out(state)
     if (others := images.is_posed & ~among).any():
         points = points.seen_by(others, source.view.num_keypoints, source.view.links())
-    pictures = ModelPictures(images, source.view.keypoints, source.view.num_keypoints)
+    pictures = ModelKeypoints(images, source.view.keypoints, source.view.num_keypoints)
     structure = Structure(points, images, pictures, among, None if source.fixed is None else ~source.fixed)
     source = replace(source, tied=_tied_by_priors(state, images))
     found, gauge = gather_evidence(source, fits, structure, clock.threads), state.gauge
@@ -118,7 +118,7 @@ def confirm_by_pixels(state: ModelState) -> BoolArray:
     if not (doubted.any() and source.has_database):
         return np.zeros_like(doubted)
     images = with_left_out(state)
-    pictures = ModelPictures(images, source.view.keypoints, source.view.num_keypoints)
+    pictures = ModelKeypoints(images, source.view.keypoints, source.view.num_keypoints)
     names = images.names_of(np.flatnonzero(doubted))
     return images.are_named(ask_pixels(source, Structure(state.points, images, pictures), names))
 
@@ -137,7 +137,7 @@ def _tied_by_priors(state: ModelState, images: Images) -> IntArray | None:
     if state.held is None:
         return None
     centers = images.centers[images.is_posed]
-    most = RARE * float(np.linalg.norm(np.ptp(centers, axis=0)))
+    most = CHANCE_SHARE * float(np.linalg.norm(np.ptp(centers, axis=0)))
     frames = state.held.indices[state.held.sigmas() <= most]
     return rigid_strip(images, np.isin(images.frame_of, frames) & images.is_posed)
 

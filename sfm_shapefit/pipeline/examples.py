@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit import evaluate, inspect, locate, map_database, place, relative_rotations, solve, synthetic
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
@@ -42,7 +42,7 @@ from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
 from sfm_shapefit.synthetic.workspace import write_workspace
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 
 
 def _random_graph(dimension: int = 3, num_nodes: int = 20) -> ViewGraph:

@@ -13,8 +13,8 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
 from sfm_shapefit.base.wording import first_of
+from sfm_shapefit.facts.command_options import PlacingOptions, Source
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, intrinsics_in_doubt
-from sfm_shapefit.facts.options import PlacingOptions, Source
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, open_database
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
@@ -28,8 +28,8 @@ from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.files.pair_list import read_pair_list
 from sfm_shapefit.pairs.focal_lengths import find_lenses
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.placement.gauge_options import KnownDistance, Scale
 from sfm_shapefit.placement.memory_plan import MEMORY_PLANS, MemoryPlan
-from sfm_shapefit.placement.options import KnownDistance, Scale
 from sfm_shapefit.scene.freedom import PARTS_FREED, IntrinsicsFreedom
 from sfm_shapefit.scene.given import NOTHING_KNOWN, Known
 from sfm_shapefit.scene.images import Images

@@ -6,8 +6,8 @@ from typing import Any
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.facts.command_options import InspectOptions
 from sfm_shapefit.facts.inspected import Inspection
-from sfm_shapefit.facts.options import InspectOptions
 from sfm_shapefit.files.colmap.listed_poses import is_list, read_source
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.graph_text import read_graph

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import flat_values, merge_options
+from sfm_shapefit.facts.command_options import JoinOptions
 from sfm_shapefit.facts.map_result import JoinedModel
-from sfm_shapefit.facts.options import JoinOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model

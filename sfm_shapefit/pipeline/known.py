@@ -9,15 +9,15 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.options import FIX_SOLVED, Rotations
+from sfm_shapefit.facts.command_options import FIX_SOLVED, Rotations
 from sfm_shapefit.files.colmap.control_points import read_control_points
 from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.lines import text_of
-from sfm_shapefit.placement.options import GaugeOptions
-from sfm_shapefit.rotations.options import GRAVITY_OF_DATABASE
+from sfm_shapefit.placement.gauge_options import GaugeOptions
+from sfm_shapefit.rotations.averaging_options import GRAVITY_OF_DATABASE
 from sfm_shapefit.scene.given import ControlPoints, Gravity, Known, PositionPriors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import names_among, same_images

@@ -14,7 +14,7 @@ import numpy as np
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.command_options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.listed_poses import read_source
 from sfm_shapefit.files.colmap.model import ModelSource

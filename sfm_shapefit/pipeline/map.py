@@ -14,12 +14,12 @@ from typing import Any
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import MapResult, tell_joins
 from sfm_shapefit.facts.map_warnings import lost_distances, map_warnings
-from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
-from sfm_shapefit.pairs.options import LEAST_MATCHES
+from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import MapContext, start_run
 from sfm_shapefit.pipeline.mapping import join_mapped, locate_components, refine_intrinsics

@@ -20,10 +20,10 @@ from sfm_shapefit.files.colmap.photographs import (
     refuse_rigs,
 )
 from sfm_shapefit.files.colmap.picture_matches import read_descriptors
-from sfm_shapefit.files.options import MATCHING_FILE, MOST_EXHAUSTIVE, MatchingOptions
+from sfm_shapefit.files.matching_options import MATCHING_FILE, MOST_EXHAUSTIVE, MatchingOptions
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, alike_pairs
 from sfm_shapefit.scene.sequences import find_sequences
-from sfm_shapefit.solver.options import SolverOptions
+from sfm_shapefit.solver.solver_options import SolverOptions
 
 _ALIKE, _ALIKE_OF_SEQUENCE = 30, 5
 """Alike images that each is matched with: as many as COLMAP's retrieval would be asked for, or, where those

@@ -16,8 +16,8 @@ from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.estimate import estimate_directions
-from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
@@ -25,7 +25,7 @@ from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, is_among, rows_of_pairs
 from sfm_shapefit.tracks.node_tracks import TrackJoiner, covering_set, join_points
-from sfm_shapefit.tracks.options import NodeOptions, PointNodes
+from sfm_shapefit.tracks.structure_options import NodeOptions, PointNodes
 
 _CHECK_ROTATIONS = (
     "is this the model's database, with right intrinsics? Rotations that are degrees off need rotations=2"

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.command_options import InspectOptions, PlacingOptions
 from sfm_shapefit.facts.inspected import Forecast
-from sfm_shapefit.facts.options import InspectOptions, PlacingOptions
 from sfm_shapefit.files.colmap.database import MOST_KEYPOINTS, PIXEL_BYTES
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -23,7 +23,7 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import are_sampled
 from sfm_shapefit.placement.memory_plan import MEMORY_PLANS, MemoryPlan
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.matches import KEPT_MATCHES, MOST_BESIDE_TRACKS
 from sfm_shapefit.solver.solve import choose_method, plan_factor
 

@@ -19,7 +19,7 @@ from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
 from sfm_shapefit.facts.joined_cameras import JoinedGroup, joined_camera_rows, joined_verdict
-from sfm_shapefit.facts.joins import Joined
+from sfm_shapefit.facts.joins import JoinOutcome
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.model import JoinedFacts
 from sfm_shapefit.facts.placed import UNITS, KeyFigures
@@ -28,14 +28,14 @@ from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import name_of, transform_model
-from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.gauge_options import KnownDistance
 from sfm_shapefit.placement.gauge_rule import gauge_of_distances
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
-from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.placement.prior_join import PlacedByPriors, join_by_priors, place_by_priors
 from sfm_shapefit.scene.given import PositionPriors
 
@@ -51,7 +51,7 @@ _SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
 class JoinInputs(NamedTuple):
     """What is known of joined models beside the models."""
 
-    joins: Sequence[Joined]
+    joins: Sequence[JoinOutcome]
     """What came of joining each model to another."""
     options: Mapping[str, Any]
     inputs: Inputs
@@ -65,7 +65,7 @@ class JoinInputs(NamedTuple):
 
 def judge_joins(
     pieces: Sequence[ModelPiece], tied: TiedPieces, priors: Sequence[PositionPriors | None] = ()
-) -> Iterator[Joined]:
+) -> Iterator[JoinOutcome]:
     """Yield what comes of joining each piece but the first: by pairs, or else by `priors` of its cameras."""
     outcomes = join_pieces(tied.cameras, tied.ties)
     usable = [] if tied.cameras.is_metric.any() else priors
@@ -78,7 +78,7 @@ def judge_joins(
         join = _at_known_scale(pieces, done) if isinstance(done, PieceJoin) else None
         to = 0 if join is None else join.to
         pairs = [] if join is None else tied.ties.matches.pairs[join.rivals].tolist()
-        yield Joined(
+        yield JoinOutcome(
             model=number,
             to=to,
             found=join,
@@ -126,7 +126,7 @@ def _join_by_priors(number: int, placed: Sequence[PlacedByPriors | str]) -> Piec
 
 
 def merge_groups(
-    pieces: Sequence[ModelPiece], tied: TiedPieces, joins: Sequence[Joined]
+    pieces: Sequence[ModelPiece], tied: TiedPieces, joins: Sequence[JoinOutcome]
 ) -> list[JoinedGroup]:
     """Return the pieces that were joined, each group in the world of its first."""
     growing: dict[int, _Growing] = {}
@@ -149,7 +149,7 @@ class _Growing:
         self.ids: dict[int, Mapping[int, int]] = {number: {i: i for i in reconstruction.point3D_ids()}}
         """New ids of each piece's points, by the old ones."""
 
-    def add(self, done: Joined, piece: ModelPiece, tied: TiedPieces) -> None:
+    def add(self, done: JoinOutcome, piece: ModelPiece, tied: TiedPieces) -> None:
         """Take in a piece that was joined to one of the group."""
         assert done.join is not None
         world_from = compose(self.group.world_from[done.to], done.join.to_from_piece)

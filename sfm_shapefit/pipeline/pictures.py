@@ -22,7 +22,7 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.picture_matches import PictureMatches, read_descriptors
-from sfm_shapefit.files.colmap.points import ModelPictures
+from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, Shared, choose_pairs
 from sfm_shapefit.judgement.pair_fits import PairFits
@@ -30,7 +30,7 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.matches import is_among
 from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.filter import filter_points
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 
 _FOR_FEATURES = 0.6  # share of the minutes; features take half of the time where there is no limit
 
@@ -100,7 +100,7 @@ def _whys(whys: Sequence[str]) -> str:
 def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:
     """Return the points that matches make where the cameras stand, but for those of contradicting pairs."""
     images, view = source.images, source.view
-    pictures = ModelPictures(images, view.keypoints, view.num_keypoints)
+    pictures = ModelKeypoints(images, view.keypoints, view.num_keypoints)
     links = view.links(chosen=~is_among(view.pairs, fits.sides[1]))
     matches = collect_matches(images, pictures, np.arange(images.num_images), links, view.num_matches)
     options = StructureOptions()

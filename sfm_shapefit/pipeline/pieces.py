@@ -13,7 +13,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import METRIC_SIGMA, normalized
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model, renamed_as
-from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of
+from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of
 from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import Matches, PairNames, RayMatches
@@ -151,7 +151,7 @@ class _Seen:
         for v, name in enumerate(self.names):
             self.of_name.setdefault(name, []).append(v)
         self.pictures = [
-            ModelPictures(i, points2d_of(p.model.arrays, i)) for p, i in zip(pieces, every, strict=True)
+            ModelKeypoints(i, points2d_of(p.model.arrays, i)) for p, i in zip(pieces, every, strict=True)
         ]
         self.observed = [self._observed(v) for v in range(len(self.names))]
 

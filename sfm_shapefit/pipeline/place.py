@@ -22,8 +22,8 @@ from sfm_shapefit.pipeline.pose_graphs import (
     without_contradicted,
 )
 from sfm_shapefit.placement.place import place_pieces
-from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.solver.options import OnIteration, reported
+from sfm_shapefit.refinement.placement_options import PlacementOptions
+from sfm_shapefit.solver.solver_options import OnIteration, reported
 
 if TYPE_CHECKING:
     import pycolmap

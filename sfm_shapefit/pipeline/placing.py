@@ -19,11 +19,11 @@ from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.pipeline.measure import add_evidence, build_graph
 from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged
 from sfm_shapefit.placement.place import InitialPlacement, Placement, place_pieces
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.solver.options import reported
+from sfm_shapefit.solver.solver_options import reported
 from sfm_shapefit.solver.tied import largest_tied
-from sfm_shapefit.tracks.options import NodeOptions
+from sfm_shapefit.tracks.structure_options import NodeOptions
 
 _FITTING = 0.95  # share of pairs that agree with a placement; from here on no other is tried
 _MOST_TRIED = 5_000  # nodes; more take seconds

@@ -34,7 +34,7 @@ from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
+from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
@@ -51,7 +51,7 @@ from sfm_shapefit.judgement.reasons import (
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
-from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
@@ -164,7 +164,7 @@ def read_structure(state: CheckState, clock: Clock) -> CheckState:
     """Read the points of a model, and how well they hold each image."""
     with clock("points"):
         arrays, images = state.model.arrays, state.images
-        pictures = ModelPictures(images, points2d_of(arrays, images))
+        pictures = ModelKeypoints(images, points2d_of(arrays, images))
         structure = Structure(points_of(arrays, images), images, pictures)
         quality = image_quality(*structure[:3])
         weak = tuple(find_weak_images(images, quality))
@@ -282,7 +282,6 @@ def _of_alike_pictures(findings: Iterable[Reason]) -> Iterator[Reason]:
 
 
 def _pair_rows(images: Images, fits: PairFits | None) -> Table[PairRow]:
-    """Return a row per pair; none without any."""
     if fits is None:
         return Table(PairRow, 3, {"name1": []})
     directions, is_judged = fits.directions, np.isfinite(fits.residuals_deg)

@@ -15,6 +15,7 @@ from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.pairs.direction_options import LEAST_MATCHES, DirectionOptions
 from sfm_shapefit.pairs.essential import (
     LikelyPoses,
     concatenate_rotations,
@@ -22,12 +23,11 @@ from sfm_shapefit.pairs.essential import (
     have_many_pairs,
 )
 from sfm_shapefit.pairs.estimate import estimate_directions
-from sfm_shapefit.pairs.options import LEAST_MATCHES, DirectionOptions
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.scene.matches import RayMatches, View
-from sfm_shapefit.solver.options import SolverOptions
+from sfm_shapefit.solver.solver_options import SolverOptions
 
 # Pairs of each image that are tried for by themselves where there are very many: all lie near their average.
 _FIRST_PAIRS = 5

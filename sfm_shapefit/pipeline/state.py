@@ -13,7 +13,7 @@ from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
-from sfm_shapefit.files.colmap.points import ModelPictures
+from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import Judged
@@ -177,10 +177,12 @@ class ModelState:
         given = GivenPoses(rotations, self.inputs.fixed_frames, self.held)
         return given.of(np.unique(images.frame_of[rows]))
 
-    def pictures(self, images: Images, rows: IntArray) -> ModelPictures:
+    def pictures(self, images: Images, rows: IntArray) -> ModelKeypoints:
         """Return the keypoints of some images (r,), and their lenses."""
         chosen, view = rows.tolist(), self.source.view
-        return ModelPictures(images.part(rows), lambda k: view.keypoints(chosen[k]), view.num_keypoints[rows])
+        return ModelKeypoints(
+            images.part(rows), lambda k: view.keypoints(chosen[k]), view.num_keypoints[rows]
+        )
 
     def read_links(self, images: Images, advance: Advance, *, rejected: bool = False) -> Links:
         """Return what joins the keypoints of posed images, or matches of rejected pairs; rays are forgotten.

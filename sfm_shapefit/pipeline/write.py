@@ -28,7 +28,7 @@ from sfm_shapefit.facts.rows import covariances_of, covariances_text, own_camera
 from sfm_shapefit.facts.tables import CameraRow, Table, write_rows
 from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
-from sfm_shapefit.files.options import MADE_FIRST, SIDECARS
+from sfm_shapefit.files.matching_options import MADE_FIRST, SIDECARS
 
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing

@@ -28,7 +28,7 @@ from sfm_shapefit.scene.given import (
 )
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.triangulation import PointLimits, triangulate_tracks
 
 _MARK_ERRORS = 4.0  # keypoint errors; marks are set by hand, in a model that may be bent

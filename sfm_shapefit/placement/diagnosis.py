@@ -29,7 +29,7 @@ from sfm_shapefit.graph.triangle_scores import triangle_scores
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.placement.conditioning import FEW_PAIRS, NEARLY_PARALLEL, direction_spread
 from sfm_shapefit.placement.place import count_large, order_pieces, refuse_without_triangle
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.refinement.starts import has_second_start
 from sfm_shapefit.solver.solve import choose_method
 

@@ -23,7 +23,7 @@ from sfm_shapefit.placement.gauge import (
     prior_gauge,
     unit_gauge,
 )
-from sfm_shapefit.placement.options import KnownDistance, Scale
+from sfm_shapefit.placement.gauge_options import KnownDistance, Scale
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.images import Images
 

@@ -50,7 +50,7 @@ from sfm_shapefit.placement.piece_ties import (
     direct_ties,
     turn_pieces,
 )
-from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.solver.solver_options import SolverResult
 
 FEWEST_PAIRS = 3
 """Agreeing pairs that a join needs; a wrong one has two by chance, and two leave nothing to check it by."""
@@ -205,7 +205,7 @@ def _without(points: FloatArray, *others: FloatArray) -> FloatArray:
     return points[~np.isin(points[:, 0], np.concatenate(others)[:, 0])]
 
 
-class _Joint(NamedTuple):
+class _JoinedWorld(NamedTuple):
     """Pieces in the world of the first, and which pairs agree."""
 
     evidence: _Evidence
@@ -239,7 +239,7 @@ class _Joint(NamedTuple):
         return support
 
 
-def _search(evidence: _Evidence, enough: int) -> _Joint:
+def _search(evidence: _Evidence, enough: int) -> _JoinedWorld:
     """Place pieces; two, of which fewer pairs agree than are enough, by other turns that are voted for too.
 
     Raises:
@@ -261,7 +261,7 @@ def _search(evidence: _Evidence, enough: int) -> _Joint:
     return best
 
 
-def _search_alone(best: _Joint) -> _Joint:
+def _search_alone(best: _JoinedWorld) -> _JoinedWorld:
     """Place two pieces, of which too few pairs agree, by each pair alone, the soundest first."""
     evidence = best.evidence
     if evidence.cameras.num_pieces > 2:
@@ -278,7 +278,7 @@ def _search_alone(best: _Joint) -> _Joint:
     return best
 
 
-def _better(best: _Joint, other: _Joint) -> _Joint:
+def _better(best: _JoinedWorld, other: _JoinedWorld) -> _JoinedWorld:
     """Return of two joints of the same pieces the one with which more pairs of the first agree."""
     agrees = _agreeing(best.evidence, other.standing)
     if best.evidence.weigh(agrees) <= best.evidence.weigh(best.agrees):
@@ -286,7 +286,7 @@ def _better(best: _Joint, other: _Joint) -> _Joint:
     return other._replace(evidence=best.evidence, agrees=agrees)
 
 
-def _place(evidence: _Evidence) -> _Joint:
+def _place(evidence: _Evidence) -> _JoinedWorld:
     """Place all pieces that are tied to the first, and see which pairs agree.
 
     Raises:
@@ -308,7 +308,7 @@ def _place(evidence: _Evidence) -> _Joint:
         return _place(evidence.part(evidence.numbers[tied]))
     standing, solved = solve_pieces(evidence.cameras, evidence.ties, directions, turns)
     standing, covariances = refine_pieces(evidence.cameras, evidence.ties.subset(used), standing)
-    return _Joint(evidence, standing, covariances, _agreeing(evidence, standing), solved)
+    return _JoinedWorld(evidence, standing, covariances, _agreeing(evidence, standing), solved)
 
 
 def _agreeing(evidence: _Evidence, standing: Standing) -> BoolArray:
@@ -348,7 +348,7 @@ def _grow(evidence: _Evidence) -> Iterator[tuple[int, PieceJoin | str]]:
         evidence = evidence.part(np.append(evidence.numbers[0], accepted))
 
 
-def _judge(joint: _Joint, rivals: "_Rivals") -> Iterator[PieceJoin]:
+def _judge(joint: _JoinedWorld, rivals: "_Rivals") -> Iterator[PieceJoin]:
     """Yield the join of each piece but the first, or why it is refused."""
     evidence = joint.evidence
     clean, whole = joint.support(~rivals.in_doubt), joint.support(np.ones_like(rivals.in_doubt))
@@ -384,7 +384,7 @@ class _Rivals(NamedTuple):
     """Pairs, by their numbers among all, that agree with the join where points speak for the other."""
 
 
-def _find_rivals(joint: _Joint, false: IntArray) -> _Rivals:
+def _find_rivals(joint: _JoinedWorld, false: IntArray) -> _Rivals:
     """Look between every two pieces for pairs that agree on another join, and ask points which is right.
 
     Pairs that were found false are rivals, by their numbers among all.
@@ -423,7 +423,7 @@ def _speaks(first: int, second: int) -> bool:
     return first >= _FEWEST_POINTS + _CLEARLY * second
 
 
-def _rivals_among(evidence: _Evidence) -> Iterator[tuple[_Joint, bool]]:
+def _rivals_among(evidence: _Evidence) -> Iterator[tuple[_JoinedWorld, bool]]:
     """Yield other joins of two pieces: first that with which most pairs agree, then those by single pairs."""
     alone = np.argsort(-evidence.votes.soundness, kind="stable")[:_MOST_ALONE]
     with suppress(UnsolvableError):
@@ -438,7 +438,7 @@ def _rivals_among(evidence: _Evidence) -> Iterator[tuple[_Joint, bool]]:
             yield rival._replace(evidence=evidence, agrees=agrees), False
 
 
-def _join_of(joint: _Joint, k: int, rivals: BoolArray) -> PieceJoin:
+def _join_of(joint: _JoinedWorld, k: int, rivals: BoolArray) -> PieceJoin:
     """Return the join of one piece, refused if it is uncertain."""
     evidence, standing = joint.evidence, joint.standing
     middles, size = evidence.cameras.middles(), evidence.cameras.sizes()[k]

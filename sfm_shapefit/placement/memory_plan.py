@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.matches import PLENTY, Reading
-from sfm_shapefit.solver.options import NO_FACTOR
+from sfm_shapefit.solver.solver_options import NO_FACTOR
 
 _FRUGAL = Reading(batch=50_000, rays_bytes=50_000_000, keeps=False)
 

@@ -28,9 +28,9 @@ from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
-from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.solver_options import SolverResult
 
 _MOST_RAYS = 30  # rays from one camera of a pair to the other's points; more tell nothing new
 _LEAST_LENGTH = 1e-6  # share of the median; ends that nearly coincide would have all of the weight

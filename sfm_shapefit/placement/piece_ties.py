@@ -14,9 +14,9 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_of_parts
 from sfm_shapefit.base.geometry import mean_rotation_l1, median_spread, nearest_rotations, rotation_angles_deg
 from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pairs.estimate import estimate_directions
-from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.scene.matches import RayMatches

@@ -22,11 +22,11 @@ from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces, rigid_pieces_o
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement
 from sfm_shapefit.refinement.near import stay_near
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
-from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import refuse_admm, solve
+from sfm_shapefit.solver.solver_options import IterationInfo, OnIteration, SolverResult
 from sfm_shapefit.solver.tied import largest_tied
 
 SMALLEST_PIECE = 3

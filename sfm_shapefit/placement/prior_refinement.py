@@ -11,7 +11,7 @@ from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement, replace_locations
 from sfm_shapefit.refinement.anchored import refine_anchored, weighted_anchors
 from sfm_shapefit.refinement.angular import KERNEL_WIDTH
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 

@@ -13,8 +13,8 @@ from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.rigidity import rigid_pieces
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.solver.options import SolverOptions, SolverResult
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.solver_options import SolverOptions, SolverResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

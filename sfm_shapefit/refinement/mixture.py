@@ -148,8 +148,6 @@ class MixtureEnd:
 
 
 class _Descent(NamedTuple):
-    """How a descent went."""
-
     path: list[FloatArray]  # (n, d) locations of each step
     end: MixtureEnd
 
@@ -173,8 +171,6 @@ class _Expectation(NamedTuple):
 
 
 class _Noise(NamedTuple):
-    """The model of one step."""
-
     levels: Levels
     floor: float  # radians; lower levels count as this one
     own: FloatArray  # (m, d - 1) rad^2, of the errors beside their levels
@@ -184,8 +180,6 @@ class _Noise(NamedTuple):
 
 
 class _System(NamedTuple):
-    """The equations of one step."""
-
     blocks: FloatArray  # (m, d, d) parts of the normal matrix
     gradient: FloatArray  # (m, d) derivative of the cost by the baselines
     damping_unit: FloatArray  # (m,)
@@ -427,7 +421,6 @@ class Mixture:
         return _prior_cost(at.lengths, noise.precision) - float(likelihood.sum())
 
     def _equations(self, at: _Residuals, precision: float, found: _Expectation) -> _System:
-        """Return the system of a step in the locations."""
         m, d = at.units.shape
         blocks, gradient = np.empty((m, d, d)), np.empty((m, d))
         _assemble(at, found.information, precision, _excess_logs(at.lengths), blocks, gradient)

@@ -10,8 +10,8 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.refinement.angular import residual_levels
 from sfm_shapefit.refinement.consensus import fit_mixture
 from sfm_shapefit.refinement.starts import OPENING_RAD, RefinedPlacement
-from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import normalize_locations
+from sfm_shapefit.solver.solver_options import SolverResult
 
 _CAP_OF_SIZE = 0.5  # spreads of all cameras; a larger distance from solved to adjusted counts no more
 _COLLAPSED = 1e-9  # spreads of the solution; cameras that fit it with a smaller spread fit it nowhere

@@ -33,9 +33,9 @@ from sfm_shapefit.refinement.consensus import (
     residual_angles,
 )
 from sfm_shapefit.refinement.posterior import TriangleEvidence, weigh_by_triangles
-from sfm_shapefit.solver.options import PAIRS_AT_SCALE, SolverOptions, SolverResult
 from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.solver_options import PAIRS_AT_SCALE, SolverOptions, SolverResult
 
 POOR_SHARE = 0.7
 """Share of right pairs that the usual answer explains; from here on it is believed, since nothing gained."""

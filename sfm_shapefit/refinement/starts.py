@@ -33,7 +33,7 @@ from sfm_shapefit.refinement.angular import (
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture, own_variances
 from sfm_shapefit.refinement.mixture import Mixture, MixtureEnd
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.refinement.posterior import TriangleEvidence
 from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.refinement.reweighted import (
@@ -43,9 +43,9 @@ from sfm_shapefit.refinement.reweighted import (
     solve_at_triangles,
     solve_reweighted,
 )
-from sfm_shapefit.solver.options import PAIRS_AT_SCALE, SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.reduction import Reduction
+from sfm_shapefit.solver.solver_options import PAIRS_AT_SCALE, SolverResult
 from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import Lud, solve_lud
 
@@ -165,8 +165,6 @@ class RefinedPlacement:
 
 
 class _Problem(NamedTuple):
-    """What the starts of a graph are refined on."""
-
     measured: MeasuredGraph
     normal_solver: FactorPlan | LaplacianFactor | None
     """What the refinement solves its steps with; None where the starts are not refined."""
@@ -428,7 +426,6 @@ def _reweight(
 
 
 def _start_of(reweighted: Reweighted) -> Start:
-    """Return the reweighted start among the others."""
     return Start(
         name="reweighted ShapeFit",
         locations=reweighted.solved.locations,

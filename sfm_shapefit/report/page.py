@@ -23,8 +23,8 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.record import plain
 from sfm_shapefit.base.settings import flat_values
+from sfm_shapefit.facts.command_options import LocateOptions, MapOptions
 from sfm_shapefit.facts.model import FactsOfModel, JoinedFacts
-from sfm_shapefit.facts.options import LocateOptions, MapOptions
 from sfm_shapefit.facts.placed import Facts, GraphFacts, Piece
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.evidence import ModelEvidence

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import JoinedModel
-from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Table
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model

@@ -310,7 +310,7 @@ class Images:
         return replace(self, sensors=replace(self.sensors, rotations=rotations, translations=translations))
 
 
-class Pictures(Protocol):
+class KeypointRays(Protocol):
     """The keypoints of images and what their lenses do with rays, by the images' rows."""
 
     def count(self, image: int) -> int:

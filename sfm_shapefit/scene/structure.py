@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from sfm_shapefit.base.arrays import BoolArray
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.points import Points
 
 
@@ -13,7 +13,7 @@ class Structure(NamedTuple):
     points: Points
     images: Images
     """Images where the model has them; NaN where it does not."""
-    pictures: Pictures
+    pictures: KeypointRays
     among: BoolArray | None = None
     """(i,) images that make the points; all if None."""
     asked: BoolArray | None = None

@@ -171,7 +171,6 @@ def _certify(
 
 
 def _refuse_arrays(graph: ViewGraph, locations: FloatArray, dual: FloatArray) -> None:
-    """Raise InputError for arrays of wrong shapes, or that are not finite."""
     shapes = (graph.num_nodes, graph.dimension), graph.directions.shape
     if locations.shape != shapes[0] or dual.shape != shapes[1]:
         raise InputError(

@@ -21,9 +21,16 @@ from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton.dense import solve_newton_dense
 from sfm_shapefit.solver.newton.sparse import solve_newton_reduced, solve_newton_sparse
-from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverOptions, SolverResult, Status, Watch
 from sfm_shapefit.solver.program import normalize_locations, objective, scale_functional
 from sfm_shapefit.solver.reduction import Reduction
+from sfm_shapefit.solver.solver_options import (
+    IterationInfo,
+    OnIteration,
+    SolverOptions,
+    SolverResult,
+    Status,
+    Watch,
+)
 from sfm_shapefit.solver.splitting.linear import Prediction, Resources, predict_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 
@@ -229,7 +236,6 @@ def _split(
     limit: int,
     watch: OnIteration | None,
 ) -> SolverRun:
-    """Solve by splitting, and say how it ended."""
     found = solve_hybrid(graph, tol, limit, resources, prediction, watch)
     note = "" if found.stop is HybridStop.CERTIFIED else found.stop.value
     return SolverRun(found.locations, found.certificate.dual, found.iterations, note)

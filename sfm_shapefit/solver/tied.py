@@ -75,7 +75,6 @@ def general_positions(groups: RigidGroups) -> FloatArray:
 
 
 def _components(ends: IntArray, count: int) -> list[IntArray]:
-    """Return the connected components of the graph of groups."""
     labels = connected_components(count, ends)
     order = np.argsort(labels, kind="stable")
     return np.split(order.astype(np.int64), np.cumsum(np.bincount(labels))[:-1])

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
         ring_graph_problem,
         trajectory_graph_problem,
     )
-    from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions, WorkspaceOptions
     from sfm_shapefit.synthetic.rendering import (
         RenderedScene,
         draw_image,
@@ -48,12 +47,13 @@ if TYPE_CHECKING:
         surface_points,
     )
     from sfm_shapefit.synthetic.rigs import make_rig_drive
+    from sfm_shapefit.synthetic.scene_options import RenderOptions, SceneOptions, WorkspaceOptions
     from sfm_shapefit.synthetic.scenes import Scene, make_scene, project_points
     from sfm_shapefit.synthetic.streets import StreetProblem, street_problem
     from sfm_shapefit.synthetic.workspace import write_workspace
 
 # In this order, a name is found before anything is imported that costs more than its own module.
-_HOMES = ("options", "graphs", "streets", "scenes", "rigs", "rendering", "workspace")
+_HOMES = ("scene_options", "graphs", "streets", "scenes", "rigs", "rendering", "workspace")
 
 __all__ = [
     "CorruptionKind",

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.mounts import Rigs, mounted
-from sfm_shapefit.synthetic.options import SceneOptions, Shape
+from sfm_shapefit.synthetic.scene_options import SceneOptions, Shape
 
 ByteArray = npt.NDArray[np.uint8]
 

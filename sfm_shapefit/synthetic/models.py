@@ -20,7 +20,7 @@ from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.scene.points import Points, number_points
 from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras
 from sfm_shapefit.synthetic.mounts import Rigs
-from sfm_shapefit.synthetic.options import ModelContent
+from sfm_shapefit.synthetic.scene_options import ModelContent
 
 
 def image_name(index: int) -> str:

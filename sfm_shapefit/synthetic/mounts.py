@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.synthetic.options import RigKind
+from sfm_shapefit.synthetic.scene_options import RigKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

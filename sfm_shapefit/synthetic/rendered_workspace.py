@@ -34,8 +34,8 @@ from sfm_shapefit.synthetic.models import (
     new_rigs,
     write_models,
 )
-from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rendering import RenderedScene, encode_images, project_distorted, surface_points
+from sfm_shapefit.synthetic.scene_options import WorkspaceOptions
 from sfm_shapefit.synthetic.workspace import compact_database, workspace_folder
 
 _LARGEST_ERROR_PX = 4.0  # pixels; COLMAP's own limit for inliers, a right match is off by no more

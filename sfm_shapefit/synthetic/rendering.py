@@ -31,7 +31,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras, lay_out_scene, state_rotations
-from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions
+from sfm_shapefit.synthetic.scene_options import RenderOptions, SceneOptions
 from sfm_shapefit.synthetic.surfaces import Surfaces, make_surfaces
 
 _SAMPLES = 2  # samples of a pixel along either side; smooths edges

@@ -16,7 +16,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.layouts import LAYOUTS, looking_along, street
 from sfm_shapefit.synthetic.mounts import rigs_of
-from sfm_shapefit.synthetic.options import SceneOptions
+from sfm_shapefit.synthetic.scene_options import SceneOptions
 from sfm_shapefit.synthetic.scenes import Scene, build_scene
 
 NUM_RIGS, NUM_SENSORS = 2, 3  # rigs, cameras of each; the fewest that differ, ahead and to both sides

@@ -34,7 +34,7 @@ from sfm_shapefit.synthetic.layouts import (
     turn_at_random,
 )
 from sfm_shapefit.synthetic.mounts import Rigs
-from sfm_shapefit.synthetic.options import SceneOptions
+from sfm_shapefit.synthetic.scene_options import SceneOptions
 
 _NEAREST_DEPTH_M = 0.3  # meters; nothing is photographed closer
 _LARGEST_VIEW_ANGLE_DEG = 80.0  # degrees from a normal to the line of sight; also the occlusion rule

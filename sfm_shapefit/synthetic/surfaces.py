@@ -19,7 +19,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.layouts import FARTHEST_M, ByteArray, street
-from sfm_shapefit.synthetic.options import Shape
+from sfm_shapefit.synthetic.scene_options import Shape
 from sfm_shapefit.synthetic.textures import facade_texture, ground_texture
 
 _HOUSE_DEPTH_M = 4.0  # meters; a terraced house's

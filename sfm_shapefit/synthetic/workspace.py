@@ -23,7 +23,7 @@ from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.synthetic import models
 from sfm_shapefit.synthetic.models import ModelParts
-from sfm_shapefit.synthetic.options import WorkspaceOptions
+from sfm_shapefit.synthetic.scene_options import WorkspaceOptions
 from sfm_shapefit.synthetic.scenes import Scene
 
 _CALIBRATED = 2  # value of COLMAP's TwoViewGeometry::ConfigurationType; see its header

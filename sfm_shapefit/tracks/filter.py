@@ -9,13 +9,15 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
-from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import batch_ranges
 from sfm_shapefit.scene.points import Points
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 
 
-def filter_points(points: Points, images: Images, pictures: Pictures, options: StructureOptions) -> Points:
+def filter_points(
+    points: Points, images: Images, pictures: KeypointRays, options: StructureOptions
+) -> Points:
     """Return the points that satisfy the options, their observations that do, and their errors.
 
     Args:
@@ -35,7 +37,7 @@ def filter_points(points: Points, images: Images, pictures: Pictures, options: S
 
 
 def keypoint_errors_px(
-    points: Points, images: Images, pictures: Pictures, *, ahead: bool = True
+    points: Points, images: Images, pictures: KeypointRays, *, ahead: bool = True
 ) -> FloatArray:
     """Return the distance of each observation from its point's projection, (o,); NaN where that is not seen.
 

@@ -87,7 +87,6 @@ class ObservedTracks(Lists):
         return self._of_rows(joined, np.arange(len(joined.offsets) - 1))
 
     def _of_rows(self, joined: JoinedRows, ids: IntArray) -> "ObservedTracks":
-        """Return tracks that consist of rows of the observations."""
         rows = joined.rows
         return replace(
             self,
@@ -172,7 +171,6 @@ class MatchedKeypoints:
 
 
 def _join(matches: npt.NDArray[np.integer], given: Any, parents: Int32Array, threads: int) -> None:
-    """Join the keypoints of the matches that agree with the poses."""
     agree = np.empty(len(matches), dtype=np.bool_)
     in_ranges(threads, len(matches), _find_agreeing, matches, agree, *given)
     _merge(matches, agree, parents)

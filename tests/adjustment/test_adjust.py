@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment import solve as adjustment_solve
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem, LensPrior, RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
 from sfm_shapefit.adjustment.run import without_lone_frames

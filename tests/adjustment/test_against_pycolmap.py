@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.base.geometry import fit_similarity
 from tests.adjustment.test_views import disturbed, scene
 from tests.models import centers_of

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.gauge import free_similarities, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.solve import adjust, linearize_all, values_of
 from sfm_shapefit.laplacian.operators import Workers

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.layout import SLOTS, lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import sum_priors
 from sfm_shapefit.adjustment.problem import LensPrior, RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.residuals import linearize, reprojection_residuals

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.solve import adjust
 from tests.adjustment.made import ring_problem
 

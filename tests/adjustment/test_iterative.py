@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.iterative_factor import IterativeFactor
 from sfm_shapefit.adjustment.layout import lay_out
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import (
     AdjustmentProblem,
     LensPrior,

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.layout import lay_out
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.scene.lens import Lens
 from tests.adjustment.made import LENSES, disturb, observed, ring_problem

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.given_rotations import noise_px_of
 from sfm_shapefit.adjustment.lengths import estimate_lengths
-from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import Rig
 from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.base.errors import InputError

@@ -8,7 +8,7 @@ from numpy.polynomial import Legendre
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment import shared_errors
-from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.adjustment.solve import adjust

@@ -17,7 +17,7 @@ from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.scene.matches import KeypointMatches
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 from tests.models import arrays, centers_of
 from tests.scenes import BUNDLED

@@ -63,7 +63,7 @@ def test_the_schema_has_each_record_once_with_the_sentences_of_its_fields():
     assert definitions["Inner"]["properties"]["length"]["anyOf"] == [{"type": "number"}, {"type": "null"}]
 
 
-class Measured(Record):
+class MeasuredPairs(Record):
     """A record that code computes with, too."""
 
     num: Annotated[int, "How many."]
@@ -72,10 +72,10 @@ class Measured(Record):
 
 
 def test_a_field_without_a_sentence_stands_in_no_json():
-    measured = Measured(num=2, values=(0.5, 1.5))
+    measured = MeasuredPairs(num=2, values=(0.5, 1.5))
     assert measured.values == (0.5, 1.5)
     assert measured.summary() == plain(measured) == {"num": 2}
-    assert Measured.taken_from(measured) == measured
+    assert MeasuredPairs.taken_from(measured) == measured
     definitions = {}
-    schema_of(Measured, definitions, {})
+    schema_of(MeasuredPairs, definitions, {})
     assert [*definitions["Measured"]["properties"]] == definitions["Measured"]["required"] == ["num"]

@@ -19,18 +19,18 @@ from sfm_shapefit.base.settings import (
     option,
     setting_groups,
 )
-from sfm_shapefit.facts.options import InspectOptions, LocateOptions, MapOptions, SourceOptions
+from sfm_shapefit.facts.command_options import InspectOptions, LocateOptions, MapOptions, SourceOptions
 from sfm_shapefit.facts.placed import UNITS
 from sfm_shapefit.facts.tables import CameraRow, Table
-from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.placement.gauge import ScaleKind
-from sfm_shapefit.placement.options import GaugeOptions
-from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.rotations.options import AveragingOptions
+from sfm_shapefit.placement.gauge_options import GaugeOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
+from sfm_shapefit.rotations.averaging_options import AveragingOptions
 from sfm_shapefit.scene.freedom import FreedomOptions
-from sfm_shapefit.solver.options import SolverOptions
+from sfm_shapefit.solver.solver_options import SolverOptions
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions, random_graph_problem
-from sfm_shapefit.tracks.options import NodeOptions, StructureOptions
+from sfm_shapefit.tracks.structure_options import NodeOptions, StructureOptions
 from tests.scenes import RING
 
 NAN = float("nan")

@@ -17,7 +17,7 @@ import sfm_shapefit
 from sfm_shapefit.base import atomic_folder as output
 from sfm_shapefit.base.settings import setting_groups
 from sfm_shapefit.cli import app
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.command_options import LocateOptions
 from sfm_shapefit.facts.placed import UNITS
 from sfm_shapefit.files.colmap.sqlite_file import database_in
 from sfm_shapefit.files.graph_text import graph_text

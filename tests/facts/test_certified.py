@@ -8,7 +8,7 @@ import pytest
 from sfm_shapefit import synthetic
 from sfm_shapefit.facts.placed import Delivered
 from sfm_shapefit.pipeline.place import place
-from sfm_shapefit.solver.options import Status
+from sfm_shapefit.solver.solver_options import Status
 
 
 @pytest.fixture(scope="module")

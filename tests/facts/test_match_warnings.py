@@ -9,8 +9,8 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.facts.map_warnings import map_warnings
 from sfm_shapefit.facts.warnings import match_warnings
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.estimate import estimate_directions
-from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.scene.matches import RayMatches
 from sfm_shapefit.synthetic import SceneOptions, make_scene

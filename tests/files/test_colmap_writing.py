@@ -21,7 +21,7 @@ from sfm_shapefit.files.colmap.seed import SeededModel, pick_points, write_model
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import number_points
-from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.structure_options import StructureOptions
 from tests.models import arrays, centers_of
 from tests.problems import all_pairs
 from tests.structures import (

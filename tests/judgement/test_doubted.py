@@ -15,8 +15,8 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.doubted import confirm_cameras, weigh_doubts
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.turns import Doubt
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.essential import concatenate_rotations
-from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.doubts import ask_pairs, ask_rotations, doubt_cameras
 from sfm_shapefit.pipeline.inputs import inputs_from, see_matches
 from sfm_shapefit.pipeline.measure import measure

@@ -12,7 +12,7 @@ from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.points import ModelPictures, points_of
+from sfm_shapefit.files.colmap.points import ModelKeypoints, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.judgement.support import (
@@ -25,7 +25,7 @@ from sfm_shapefit.pipeline.finish import finish_model
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.seed import seed_points
 from sfm_shapefit.pipeline.stages import set_gauge
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.matches import is_among
 from tests.models import arrays, posed
 from tests.pipeline.made import FOLDER, opened, state_at
@@ -48,7 +48,7 @@ def counted_at(images, points, apart=NO_PAIRS):
         counted = PartnerCounts(images, view.num_keypoints, options.structure.max_reprojection_error_px)
         is_apart = is_among(view.pairs, apart)
         for batches in (view.links(chosen=is_apart), view.links(chosen=~is_apart)):
-            pictures = ModelPictures(images, view.keypoints)
+            pictures = ModelKeypoints(images, view.keypoints)
             counted.add(collect_matches(images, pictures, every, batches, view.num_matches), poses)
     return counted.compare(points)
 

@@ -6,12 +6,12 @@ import pytest
 from sfm_shapefit.judgement import ties
 from sfm_shapefit.judgement.ties import NodeLinks, Rays, find_groups, links_of_pairs, rigid_groups
 
-HALF = 6
-N = 2 * HALF
+RIVAL_SHARE = 6
+N = 2 * RIVAL_SHARE
 INNER = 40
 
 
-def rays_of(*seen, misses=(), by=range(HALF, N)):
+def rays_of(*seen, misses=(), by=range(RIVAL_SHARE, N)):
     """Rays of points, each seen by a tuple of cameras; those of some points miss in some cameras."""
     points, nodes = np.repeat(np.arange(len(seen)), [len(each) for each in seen]), np.concatenate(seen)
     return Rays(points, nodes, ~(np.isin(nodes, by) & np.isin(points, list(misses))))
@@ -20,9 +20,9 @@ def rays_of(*seen, misses=(), by=range(HALF, N)):
 def halves():
     """Points that three neighbors of each half see."""
     return [
-        tuple(side + (k + step) % HALF for step in range(3))
-        for side in (0, HALF)
-        for k in range(HALF)
+        tuple(side + (k + step) % RIVAL_SHARE for step in range(3))
+        for side in (0, RIVAL_SHARE)
+        for k in range(RIVAL_SHARE)
         for _ in range(INNER)
     ]
 
@@ -46,9 +46,9 @@ FROM_BOTH = (0, 1, 7, 8)
 
 def test_halves_that_nothing_crosses_are_two_groups_of_which_the_further_one_is_loose():
     group, (half,) = found()
-    assert len(set(group[:HALF])) == len(set(group[HALF:])) == 1
-    assert group[0] != group[HALF]
-    assert half.images == tuple(map(str, range(HALF, N)))
+    assert len(set(group[:RIVAL_SHARE])) == len(set(group[RIVAL_SHARE:])) == 1
+    assert group[0] != group[RIVAL_SHARE]
+    assert half.images == tuple(map(str, range(RIVAL_SHARE, N)))
     assert (half.num_agreeing, half.num_contradicting, half.num_points, half.is_loose) == (0, 0, 0, True)
 
 
@@ -77,7 +77,7 @@ def test_two_cameras_alone_are_no_group():
 
 def test_points_that_one_camera_sees_of_the_other_half_say_where_that_stands_but_not_how_large_the_half_is():
     _, (half,) = found(*[(0, 7, 8)] * 100)
-    assert {*map(int, half.images)} - {0} in ({*range(1, HALF)}, {*range(HALF, N)})
+    assert {*map(int, half.images)} - {0} in ({*range(1, RIVAL_SHARE)}, {*range(RIVAL_SHARE, N)})
     assert half.is_loose
     tied, groups = found(*[(0, 7, 8)] * 100, *[(1, 7, 8)] * 15)
     assert (len(set(tied)), groups) == (1, ())
@@ -96,7 +96,7 @@ def test_points_that_one_camera_sees_of_the_other_half_say_where_that_stands_but
     ],
 )
 def test_three_pairs_tie_two_groups_if_two_are_left_without_any_camera(agreeing, num_against, ties, is_loose):
-    against = [(k // HALF, HALF + k % HALF) for k in range(num_against)]
+    against = [(k // RIVAL_SHARE, RIVAL_SHARE + k % RIVAL_SHARE) for k in range(num_against)]
     group, groups = found(agreeing=agreeing, contradicting=against)
     assert len(set(group)) == 1 + is_loose
     told = [(one.num_agreeing, one.num_contradicting, one.is_loose) for one in groups]

@@ -8,7 +8,7 @@ from sfm_shapefit.scene.matches import KeypointMatches
 from tests.judgement.test_left_out import FOCAL_PX, NUM_IMAGES, Scene
 
 
-class Pictures(Scene):
+class KeypointRays(Scene):
     """The same, and where cameras see points."""
 
     def project(self, _image, positions, **_ahead):
@@ -33,17 +33,17 @@ def confirmed(scene, matched, doubted=(3,), num_keypoints=200):
     [((5, 8), 15, True), ((5, 8), 14, False), ((5,), 200, False)],
 )
 def test_a_right_camera_is_confirmed_by_fifteen_keypoints_that_match_two_others(matched, num_keypoints, sure):
-    assert confirmed(Pictures(), matched, num_keypoints=num_keypoints) == ([3] if sure else [])
+    assert confirmed(KeypointRays(), matched, num_keypoints=num_keypoints) == ([3] if sure else [])
 
 
 def test_a_wrong_camera_and_what_matches_only_doubted_ones_is_not_confirmed():
-    assert confirmed(Pictures(turned=3), (5, 8)) == []
-    assert confirmed(Pictures(), (5, 8), doubted=(3, 5)) == []
-    assert confirmed(Pictures(), (5, 8, 9), doubted=(3, 5)) == [3]
+    assert confirmed(KeypointRays(turned=3), (5, 8)) == []
+    assert confirmed(KeypointRays(), (5, 8), doubted=(3, 5)) == []
+    assert confirmed(KeypointRays(), (5, 8, 9), doubted=(3, 5)) == [3]
 
 
 def test_of_the_keypoints_that_speak_two_thirds_are_to_fit():
     for num_missing, sure in ((60, [3]), (70, [])):
-        scene = Pictures()
+        scene = KeypointRays()
         scene.plane[3, :num_missing] += 0.1
         assert confirmed(scene, (5, 8)) == sure

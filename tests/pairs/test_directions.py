@@ -7,8 +7,8 @@ import pytest
 
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity, normalized, tangent_bases
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.estimate import estimate_directions
-from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.scene.matches import RayMatches
 from sfm_shapefit.solver.solve import solve

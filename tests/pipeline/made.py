@@ -21,7 +21,7 @@ from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, choose_inputs, 
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement, place_pieces
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.given import Known
 from sfm_shapefit.scene.lens import FOCAL, PARTS
 from tests.problems import exact_graph, made_directions

@@ -13,7 +13,7 @@ from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.image_quality import find_weak_images
 from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.judgement.reasons import Grade, Kind, of_each
-from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.pictures import points_of_pictures
 from sfm_shapefit.pipeline.referee import (
     CheckState,

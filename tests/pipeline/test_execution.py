@@ -14,8 +14,8 @@ import pytest
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.estimate import estimate_directions
-from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import concatenate
 from sfm_shapefit.pipeline.execution import (
     WorkerError,

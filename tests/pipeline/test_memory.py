@@ -8,7 +8,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import InputError
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.command_options import LocateOptions
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -20,8 +20,8 @@ from sfm_shapefit.pipeline.memory import (
     keep_within_memory,
 )
 from sfm_shapefit.placement.memory_plan import MEMORY_PLANS
-from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.solver.options import NO_FACTOR
+from sfm_shapefit.refinement.placement_options import PlacementOptions
+from sfm_shapefit.solver.solver_options import NO_FACTOR
 from sfm_shapefit.synthetic import random_graph_problem
 from tests.scenes import RING
 

@@ -26,7 +26,7 @@ from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.judgement.turns import Doubt
-from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.camera_adjustment import adjust_placed
 from sfm_shapefit.pipeline.doubts import doubt_cameras
 from sfm_shapefit.pipeline.finish import finish_model
@@ -51,8 +51,8 @@ from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 from sfm_shapefit.placement.gauge_rule import GaugeRule
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import InitialPlacement
-from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.tracks.options import NodeOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
+from sfm_shapefit.tracks.structure_options import NodeOptions
 from tests.models import centers_of, only, posed
 from tests.pipeline.made import DATABASE, FOLDER, delivered, directions_of, opened, placement_at, state_at
 from tests.problems import all_pairs, exact_graph, made_priors, made_rotations, turn

@@ -13,7 +13,7 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.placement.diagnosis import diagnose
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from tests.models import turned
 from tests.problems import all_pairs, exact_graph, turn
 from tests.program import run

@@ -15,9 +15,9 @@ from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.gauge import prior_gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
-from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.solver.options import NO_FACTOR, Status
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.solver_options import NO_FACTOR, Status
 from sfm_shapefit.synthetic import random_graph_problem
 from tests.problems import made_priors, no_mixture, rig_problem
 

@@ -15,7 +15,7 @@ from sfm_shapefit.judgement.graph_grade import judge_graph
 from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.place import Placement, place_pieces
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import random_graph_problem
 from tests.problems import all_pairs

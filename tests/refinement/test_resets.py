@@ -8,7 +8,7 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement.angular import KERNEL_WIDTH
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, left_scene, openness, put_back
 from sfm_shapefit.refinement.starts import refine_starts
 from sfm_shapefit.solver.program import differences

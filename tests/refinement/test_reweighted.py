@@ -8,8 +8,8 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement.consensus import fit_mixture, penalty_of_strays, put_by_consensus
-from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.solver_options import SolverOptions
 from tests.problems import no_mixture, shape_error
 
 

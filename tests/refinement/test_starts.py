@@ -11,7 +11,7 @@ from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.refinement.starts import COLLAPSED, Start, choose_start, disagreement, refine_starts
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve

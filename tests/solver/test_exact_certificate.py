@@ -9,9 +9,9 @@ import pytest
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import certify
-from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.solver_options import SolverOptions, Status
 from tests.exact_certificate import objective_bracket, proven_bound
 
 ROUNDING = 1e-13  # 30 edges of terms of order 1 / 30 in doubles: 30 eps, and as much from the solver's scale

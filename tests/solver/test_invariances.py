@@ -11,8 +11,8 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.refinement.angular import plan_refinement, refine_angles
 from sfm_shapefit.solver.newton.dense import solve_newton_dense
 from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
-from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.solver_options import SolverOptions
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from tests.problems import lud_over, outer, rig_problem, shape
 

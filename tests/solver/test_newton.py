@@ -14,7 +14,6 @@ from sfm_shapefit.solver.newton import steps
 from sfm_shapefit.solver.newton.dense import solve_newton_dense
 from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
-from sfm_shapefit.solver.options import IterationInfo
 from sfm_shapefit.solver.program import (
     across,
     adjoint,
@@ -23,6 +22,7 @@ from sfm_shapefit.solver.program import (
     objective,
     scale_functional,
 )
+from sfm_shapefit.solver.solver_options import IterationInfo
 from tests.problems import draw_graph, shape
 
 TOL = 1e-8

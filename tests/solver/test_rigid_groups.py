@@ -11,10 +11,10 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
 from sfm_shapefit.solver.reduction import Pin, Reduction, factor_pinned
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.solver_options import SolverOptions, Status
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.solver.tied import largest_tied
 from tests.problems import lud_over, outer, rig_problem

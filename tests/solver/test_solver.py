@@ -14,7 +14,6 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
-from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import (
     adjoint,
     along,
@@ -24,6 +23,7 @@ from sfm_shapefit.solver.program import (
     scale_functional,
 )
 from sfm_shapefit.solver.solve import choose_method, solve
+from sfm_shapefit.solver.solver_options import SolverOptions, Status
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop
 from sfm_shapefit.synthetic import box_graph_problem, expander_graph_problem, random_graph_problem
 from tests.problems import all_pairs, exact_graph, shape

@@ -25,7 +25,7 @@ from sfm_shapefit.files.colmap.bitmaps import earth_position, read_bitmap
 from sfm_shapefit.files.colmap.intrinsics import fisheye_guess
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, name_of
-from sfm_shapefit.files.options import MatchingOptions
+from sfm_shapefit.files.matching_options import MatchingOptions
 
 _READABLE = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
 _OTHERS = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".mp4", ".mov", ".insv"})

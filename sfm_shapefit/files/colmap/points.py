@@ -14,7 +14,7 @@ Keypoints = Callable[[int], FloatArray | None]
 """Returns the pixels (k, 2) of the keypoints of an image by its row; k = 0 or None if there are none."""
 
 
-class ModelPictures:
+class ModelKeypoints:
     """Keypoints seen through the lenses of `images`."""
 
     def __init__(self, images: Images, keypoints: Keypoints, counts: IntArray | None = None) -> None:

@@ -37,7 +37,7 @@ from sfm_shapefit.solver.newton.steps import (
     take_step,
     working_dimension,
 )
-from sfm_shapefit.solver.options import OnIteration
+from sfm_shapefit.solver.solver_options import OnIteration
 
 _RIDGES = {4: (1e-8, 1e-8), 8: (1e-14, 1e-9)}
 """By bytes per number: first and last multiple of the identity added to M, per mean eigenvalue."""
@@ -108,7 +108,6 @@ def solve_newton_dense(
 
 
 def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseNewtonFactor:
-    """Return room for a factor of float32 or float64."""
     size, order = np.dtype(dtype).itemsize, n * d
     single, double = (order, 0) if size == 4 else (0, order)
     return DenseNewtonFactor(
@@ -202,7 +201,6 @@ def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
 
 @inner_kernel
 def _address(factor: Any) -> Any:
-    """Return the address of the matrix that is used."""
     return array_address(factor.single_matrix) if factor.is_single else array_address(factor.matrix)
 
 

@@ -18,9 +18,9 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.factor import FactorPlan, allocate_factor, analyze
 from sfm_shapefit.solver.newton import steps
 from sfm_shapefit.solver.newton.steps import Iterate, Linearization, NewtonProgress, Problem, Work
-from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import along, differences
 from sfm_shapefit.solver.reduction import Pin, Reduction, System, factor_pinned
+from sfm_shapefit.solver.solver_options import OnIteration
 
 _RIDGES = 0.0, 1e-12, 1e-10  # added to the blocks, per stiffness of the edge; in turn until M is definite
 

@@ -18,8 +18,8 @@ from sfm_shapefit.base.arrays import FloatArray, frozen
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.solver.options import IterationInfo, OnIteration, asks_to_stop
 from sfm_shapefit.solver.program import scale_functional
+from sfm_shapefit.solver.solver_options import IterationInfo, OnIteration, asks_to_stop
 
 # The smoothing relative to the gap; 0.05 to 0.3 need the same number of factorizations.
 MU_PER_GAP = 0.1

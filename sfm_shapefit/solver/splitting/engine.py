@@ -28,7 +28,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.laplacian.factor import LaplacianFactor
-from sfm_shapefit.solver.options import IterationInfo, OnIteration, asks_to_stop
+from sfm_shapefit.solver.solver_options import IterationInfo, OnIteration, asks_to_stop
 from sfm_shapefit.solver.splitting.anderson import Anderson
 from sfm_shapefit.solver.splitting.edges import CHANGE, INTERIOR, OBJECTIVE, EdgePasses
 

@@ -23,8 +23,8 @@ from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
-from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import across, adjoint, along, differences
+from sfm_shapefit.solver.solver_options import OnIteration
 from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
 from sfm_shapefit.solver.splitting.engine import Goal, Iteration, Stop, Tuning
 from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources, laplacian_factor

@@ -18,8 +18,8 @@ from sfm_shapefit.laplacian.factor import LaplacianFactor
 from sfm_shapefit.solver.certificate import Certificate, certify_in_place
 from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.newton.steps import working_dimension
-from sfm_shapefit.solver.options import OnIteration, Watch
 from sfm_shapefit.solver.program import projected_length, scale_functional
+from sfm_shapefit.solver.solver_options import OnIteration, Watch
 from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
 from sfm_shapefit.solver.splitting.engine import Goal, Iteration, Outcome, Stop, Tuning
 from sfm_shapefit.solver.splitting.linear import (

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sfm_shapefit.base.settings import Composed, explained, group, option
-from sfm_shapefit.solver.options import SolverOptions
+from sfm_shapefit.solver.solver_options import SolverOptions
 
 Objective = Literal["auto", "shapefit", "lud"]
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sfm_shapefit.base.settings import Composed, Settings, explained, group, option
-from sfm_shapefit.judgement.options import TrustOptions
-from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.placement.options import GaugeOptions
-from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.rotations.options import AveragingOptions
+from sfm_shapefit.judgement.trust_options import TrustOptions
+from sfm_shapefit.pairs.direction_options import DirectionOptions
+from sfm_shapefit.placement.gauge_options import GaugeOptions
+from sfm_shapefit.refinement.placement_options import PlacementOptions
+from sfm_shapefit.rotations.averaging_options import AveragingOptions
 from sfm_shapefit.scene.freedom import FreedomOptions
-from sfm_shapefit.tracks.options import NodeOptions, StructureOptions
+from sfm_shapefit.tracks.structure_options import NodeOptions, StructureOptions
 
 Rotations = Literal["auto", "held", "free"] | float
 Source = Literal["auto", "matches", "tracks"]

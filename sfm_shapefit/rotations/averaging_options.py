@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sfm_shapefit.base.settings import Settings, explained, option
-from sfm_shapefit.pairs.options import LEAST_MATCHES
+from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 
 Sequencing = Literal["auto", "names", "none"]
 """Which images are taken for videos: those whose matches say so too, all whose names do, or none."""
