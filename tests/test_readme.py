@@ -217,7 +217,7 @@ def test_messages_that_troubleshooting_quotes_the_program_says():
 
 def test_the_docs_are_short_and_the_table_of_options_is_made_from_their_definitions():
     assert sum(len(TEXTS[page].split()) for page in PAGES[1:] if page.stem not in FOR_CONTRIBUTORS) <= 8000
-    assert sum(len(TEXTS[ROOT / f"docs/{page}.md"].split()) for page in FOR_CONTRIBUTORS) <= 1200
+    assert sum(len(TEXTS[ROOT / f"docs/{page}.md"].split()) for page in FOR_CONTRIBUTORS) <= 1400
     assert TEXTS[ROOT / "docs/options.md"].endswith(f"{options_table.table()}\n")
 
 

@@ -52,7 +52,7 @@ SEEN = {
 
 OF_NAMED_TUPLES = {"_make", "_replace", "_asdict", "_fields"}  # public, by Python's documentation
 # A folder, a variable, keys, all in strings; and a function of the package that the room below asks for.
-OF_OURS = {"_kernels", "_claimed", "_cameras", "_offset", "_load_writers"}
+OF_OURS = {"_kernels", "_claimed", "_cameras", "_offset", "_dense", "_load_writers"}
 
 
 @pytest.mark.parametrize("name", SEEN)
