@@ -3,7 +3,7 @@
 pieces and ties -> votes, program, refinement, judgement (`placement.join`)
     -> position priors where these are not enough -> groups merged -> judged as `check` does
 
-Nothing is placed anew. What the models know of their own cameras is kept, see `facts.joined`.
+Nothing is placed anew. What the models know of their own cameras is kept, see `facts.joined_cameras`.
 """
 
 import itertools

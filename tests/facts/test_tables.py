@@ -74,9 +74,13 @@ def test_a_row_has_one_cell_per_axis_and_empty_cells_for_what_is_not_known(tmp_p
 
 @pytest.mark.parametrize(("dimension", "axes"), [(2, ["vx", "vy"]), (4, ["vx1", "vx2", "vx3", "vx4"])])
 def test_a_pair_has_one_column_per_dimension(tmp_path, dimension, axes):
-    told = {"name1": ["1"], "name2": ["2"], "direction": [(0.5,) * dimension]}
-    write_rows(Table(PairRow, dimension, told), tmp_path / "pairs.csv")
+    told = {"name1": ["1"], "name2": ["2"], "direction": [(0.5,) * dimension], "leverage": [0.25]}
+    rows = Table(PairRow, dimension, told)
+    write_rows(rows, tmp_path / "pairs.csv")
     header, cells = lines_of(tmp_path / "pairs.csv")
+    assert cells[header.index("leverage")] == "0.25"
+    assert (rows[0].scores.leverage, rows[0].direction) == (0.25, (0.5,) * dimension)
+    assert math.isnan(rows[0].scores.weight)
     assert header[2 : 2 + dimension] == axes
     assert cells[2 : 2 + dimension] == ["0.5"] * dimension
     assert len(header) == len(cells)
