@@ -33,6 +33,7 @@ from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.schur import ReducedSystem
 from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct, rank_within, rows_of_parts, sum_by
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.blocks import cut_graph, grow_blocks
@@ -178,13 +179,15 @@ class IterativeFactor:
         def job(block: _Block) -> Callable[[], None]:
             return lambda: block.refactor(system)
 
-        self._workers.run([job(block) for block in self._blocks])
-        self._space.refactor(system, self._layout.pairs)
+        with one_blas_thread():
+            self._workers.run([job(block) for block in self._blocks])
+            self._space.refactor(system, self._layout.pairs)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return steps (N, 6, r) for right-hand sides (N, 6, r), each good enough for a step."""
         sides = range(right.shape[2])
-        return np.stack([self._iterate(right[:, :, k] * self._layout.active) for k in sides], axis=2)
+        with one_blas_thread():
+            return np.stack([self._iterate(right[:, :, k] * self._layout.active) for k in sides], axis=2)
 
     def give_back(self) -> None:
         """Give up the system; blocks are small."""

@@ -78,4 +78,6 @@ def test_a_field_without_a_sentence_stands_in_no_json():
     assert MeasuredPairs.taken_from(measured) == measured
     definitions = {}
     schema_of(MeasuredPairs, definitions, {})
-    assert [*definitions["MeasuredPairs"]["properties"]] == definitions["MeasuredPairs"]["required"] == ["num"]
+    assert (
+        [*definitions["MeasuredPairs"]["properties"]] == definitions["MeasuredPairs"]["required"] == ["num"]
+    )
