@@ -103,7 +103,9 @@ def load(tmp_path):
     def say(returns="size"):
         text = f"import numpy as np\n\n\n{source.replace('size', returns)}"
         (tmp_path / "made.py").write_text(text)
-        done = run_python("-c", LOAD, tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+        # Bytecode is told from a source by its size and the second in which that was written.
+        fresh = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+        done = run_python("-c", LOAD, tmp_path, **fresh)
         assert done.returncode == 0, done.stderr
         return done.stdout.splitlines()
 
