@@ -18,8 +18,8 @@ import figure
 import options_table
 import sfm_shapefit
 from benchmarks import panoramas
+from paper import fold
 from sfm_shapefit.cli import app
-from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, make_rendered_scene
 from tests.program import run
 from tests.scenes import PHOTOGRAPHED, ROOT
@@ -48,24 +48,12 @@ def test_the_readmes_python_example_runs_and_says_what_the_readme_says(monkeypat
     assert f"The median camera is {error} mm" in text
 
 
-def test_the_peers_fold_the_yard_and_map_does_not(tmp_path):
-    shutil.copy(PHOTOGRAPHED / "database.db", tmp_path)
-    database, same = tmp_path / "database.db", {"random_seed": 0, "num_threads": 1}
-    with quiet_log():
-        models = {
-            "COLMAP": pycolmap.incremental_mapping(
-                database, tmp_path, tmp_path / "incremental", pycolmap.IncrementalPipelineOptions(**same)
-            )[0],
-            "GLOMAP": pycolmap.global_mapping(
-                database, tmp_path, tmp_path / "global", pycolmap.GlobalPipelineOptions(**same)
-            )[0],
-            "map": sfm_shapefit.map_database(database),
-        }
+def test_the_peers_fold_the_yard_and_map_does_not():
     names = ["0004.jpg", "0005.jpg"]
-    for program, model in models.items():
+    for program, model in fold.map_by_each():
         found = sfm_shapefit.evaluate(model, PHOTOGRAPHED / "truth")
         errors = dict(zip(found.names, found.position_errors.tolist(), strict=True))
-        if program == "map":
+        if program == "`map`":
             assert max(errors.values()) < 0.02
             assert list(model.verdict.cameras) == names
         else:  # the global mapper's threads may put a third one wrong

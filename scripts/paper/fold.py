@@ -27,7 +27,7 @@ COLORS = {"camera where it was": "seagreen", "camera elsewhere": "crimson", "whe
 def run(_args: argparse.Namespace) -> Figure:
     """Return the picture."""
     truth = pycolmap.Reconstruction(SCENE / "truth")
-    models = list(_models())
+    models = list(map_by_each())
     picture, axes = plt.subplots(1, len(models), figsize=(15.0, 5.2), dpi=72, layout="constrained")
     picture.get_layout_engine().set(h_pad=0.1)
     for axis, (program, model) in zip(axes, models, strict=True):
@@ -41,7 +41,7 @@ def run(_args: argparse.Namespace) -> Figure:
     return picture
 
 
-def _models() -> Iterator[tuple[str, pycolmap.Reconstruction | sfm_shapefit.LocateResult]]:
+def map_by_each() -> Iterator[tuple[str, pycolmap.Reconstruction | sfm_shapefit.LocateResult]]:
     """Yield each program with its model."""
     same = {"random_seed": 0, "num_threads": 1}
     with tempfile.TemporaryDirectory() as name, quiet_log():

@@ -105,7 +105,8 @@ class PhotographDatabase:
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
-            pool.submit(self._write, {name: one for name, one in pictures.items() if one}).result()
+            if missing:
+                pool.submit(self._write, {name: one for name, one in pictures.items() if one}).result()
         return [name for name, picture in pictures.items() if picture is None]
 
     def _read(self, name: str) -> "_Picture | None":
@@ -113,18 +114,16 @@ class PhotographDatabase:
 
     def _write(self, pictures: dict[str, "_Picture"]) -> None:
         """Write images; in a thread, as an interrupt reaches the main one alone: all are written, or none."""
+        rigs = _read_rigs(self.options)
         with quiet_log(), pycolmap.Database.open(self.database) as database:
-            prefixes = tuple(_prefixes_of(_read_rigs(self.options)))
-            lenses = _Lenses(self.options, database, prefixes)
+            lenses = _Lenses(self.options, database, tuple(_prefixes_of(rigs)))
             for camera_id, image in _first_images(database).items():
                 if picture := self._read(name_of(image)):
                     lenses.known[lenses.key(name_of(image), picture)] = database.read_camera(camera_id)
             with pycolmap.DatabaseTransaction(database):
                 for name, picture in pictures.items():
                     _write_image(database, name, lenses.lens_of(name, picture), picture)
-                pycolmap.apply_rig_config(
-                    _read_rigs(self.options), database
-                )  # a rig for each other lens, too
+                pycolmap.apply_rig_config(rigs, database)  # a rig for each other lens, too
 
     def known_names(self) -> list[str]:
         """Return the names of the images of the database by their ids; none where it does not exist."""
