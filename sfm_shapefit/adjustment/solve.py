@@ -24,13 +24,13 @@ from sfm_shapefit.adjustment.residuals import (
 )
 from sfm_shapefit.adjustment.schur import eliminate_points, step_points
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.losses import CAUCHY, loss, weighed
 from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
-from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 
 # Rounding drowns what lies beyond 1e-12 and 1e12.
 _DAMPING = DampingRange(least=1e-12, most=1e12, growth=2.0, acceleration=2.0)

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, normalized
 from sfm_shapefit.base.losses import CAUCHY, loss, weighed
@@ -29,7 +30,6 @@ from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
-from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.solver_options import SolverResult

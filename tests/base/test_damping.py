@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfm_shapefit.solver.damping import DampingRange, take_damped_step
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 
 
 def test_damping_rises_until_a_step_helps_falls_after_it_and_starts_again_where_none_helps():
