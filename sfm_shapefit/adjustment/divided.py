@@ -32,7 +32,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.executors import Crew
 from sfm_shapefit.laplacian.operators import Workers, group_by
 
-_FRAMES_OF_A_PART = 500  # frames; a part has some hundred thousand observations, which are sent once
+_FRAMES_OF_A_PART = 250  # frames; a part has some hundred thousand observations, sent once: a few MB
 
 
 class Pass(NamedTuple):

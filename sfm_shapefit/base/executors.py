@@ -74,6 +74,8 @@ class Crew:
     threads: int
     """Threads of this process."""
     cluster: Cluster | None = None
+    divides: bool = False
+    """Whether adjustments of any size are divided, for memory."""
 
     @property
     def threads_of_task(self) -> int:
@@ -115,6 +117,10 @@ class Crew:
         finally:
             for future in sent:
                 future.cancel()
+
+
+HERE = Crew(0)
+"""The threads of this process, one per core."""
 
 
 def _same(value: Answer) -> Answer:
