@@ -33,7 +33,7 @@ _RETRIES = 3  # times that dask gives a task to another worker; one that kills t
 _PATIENCE_S = 10  # seconds; a scheduler that is there answers in less than one
 
 
-class Workers(NamedTuple):
+class DaskWorkers(NamedTuple):
     """The workers of a dask scheduler, as a `Cluster`."""
 
     client: "Client"
@@ -43,7 +43,7 @@ class Workers(NamedTuple):
         return self.client.submit(work, *given, pure=False, retries=_RETRIES)
 
 
-def workers_of(client: "Client | None", file: Path | str | None) -> Workers | None:
+def workers_of(client: "Client | None", file: Path | str | None) -> DaskWorkers | None:
     """Return the workers of a client, all of which see the file of a database; None without a client.
 
     Raises:
@@ -62,7 +62,7 @@ def workers_of(client: "Client | None", file: Path | str | None) -> Workers | No
         if there.version != here.version:
             raise WorkerError(f"{of} has sfm_shapefit {there.version}, not {here.version}; install the same")
         raise WorkerError(f"{of} does not see {here.path} as it is here; share the folder, by the same path")
-    return Workers(client)
+    return DaskWorkers(client)
 
 
 class _Seen(NamedTuple):

@@ -1,4 +1,4 @@
-"""`relative_rotations`: the same by threads and by workers of a cluster, and bad input refused in a sentence."""
+"""`relative_rotations`: the same by threads and by workers, and bad input refused in a sentence."""
 
 import dataclasses
 import struct
