@@ -4,14 +4,14 @@ import enum
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.divided import Parts, Pass, largest_share
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_baselines, restore_gauge
-from sfm_shapefit.adjustment.layout import Layout, lay_out
+from sfm_shapefit.adjustment.layout import SLOTS, Layout, lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
 from sfm_shapefit.adjustment.priors import add_priors, sum_priors
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
@@ -24,6 +24,7 @@ from sfm_shapefit.adjustment.residuals import (
 )
 from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points, step_points
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.executors import Crew
@@ -32,7 +33,8 @@ from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
 
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12  # range of mu; rounding drowns what lies beyond
+# Rounding drowns what lies beyond 1e-12 and 1e12.
+_DAMPING = DampingRange(least=1e-12, most=1e12, growth=2.0, acceleration=2.0)
 _LEAST_GAIN = 1e-3  # share of the predicted decrease; a step of less is refused
 _ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in its rounding
 _NEAR = 1e-2  # relative fall of the cost by a step; after less the minimum is near, and the loss may bend
@@ -237,6 +239,12 @@ def linearize_all(
     return normal
 
 
+class _Told(NamedTuple):
+    """What a step that was tried says: a reason to stop, or None to go on from other equations."""
+
+    ending: Ending | None
+
+
 class _Run:
     """Steps by observations that are all in this process."""
 
@@ -248,8 +256,7 @@ class _Run:
         self.layout = self.lay_out()
         hand_back_memory()  # what the layout was made of goes before the largest arrays come
         self.factor = self.choose_solver()
-        self.damping, self.growth = options.first_damping, 2.0
-        self.bends, self.near = False, _NEAR
+        self.damping, self.bends, self.near = options.first_damping, False, _NEAR
         self.values, cost = self.settle(values_of(problem), _FIRST_SETTLING * options.settles_points)
         self.costs = [cost]
         self.gradient_norm, self.iterations = math.inf, 0
@@ -283,10 +290,12 @@ class _Run:
             exact = 0.5 * self.problem.num_observations * _EXACT_PX**2
             if self.gradient_norm <= self.options.gradient_tolerance or self.costs[-1] <= exact:
                 return Ending.GRADIENT
-            ending = self.lower()
+            told, _ = take_damped_step(self.attempt, self.damping, _DAMPING)
             self.forget()
-            if ending is not None:
-                return ending
+            if told is None:
+                return Ending.STALLED
+            if told.ending is not None:
+                return told.ending
 
     def linearize(self) -> None:
         """Make the normal equations at the best values, and note their gradient."""
@@ -311,49 +320,34 @@ class _Run:
         given = self.problem, self.layout, self.values, self.options, self.workers
         return linearize_all(*given, self.least_curvature)
 
-    def lower(self) -> Ending | None:
-        """Raise the damping until a step lowers the cost; return a reason to stop, or None to go on."""
-        while True:
-            if self.iterations >= self.options.max_iterations:
-                return Ending.MAX_ITERATIONS
-            before, bent = self.costs[-1], self.bends
-            predicted, accepted = self.attempt()
-            if not accepted and predicted <= _ROUNDING * before:
-                return Ending.COST if self.gradient_norm <= _STATIONARY else Ending.STALLED
-            if accepted:
-                small = before - self.costs[-1] <= self.options.cost_tolerance * before
-                return Ending.COST if small else None
-            if bent:
-                return None
-            if self.damping > _MOST_DAMPING:
-                return Ending.STALLED
-
-    def attempt(self) -> tuple[float, bool]:
-        """Try one step, take it if it lowers the cost; return the decrease predicted, and whether it did."""
+    def attempt(self, damping: float) -> "_Told | None":
+        """Try one step, take it if it lowers the cost; None asks for one of more damping."""
+        if self.iterations >= self.options.max_iterations:
+            return _Told(Ending.MAX_ITERATIONS)
         self.iterations += 1
         before = self.costs[-1]
-        values, predicted, after = self.propose() or (self.values, math.inf, before)
-        accepted = after < before and before - after >= _LEAST_GAIN * predicted
-        if accepted:
+        values, predicted, after = self.propose(damping) or (self.values, math.inf, before)
+        if after < before and before - after >= _LEAST_GAIN * predicted:
             gain = (before - after) / predicted if predicted > 0.0 else 1.0
             slower = max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
-            self.values, self.damping = values, max(self.damping * slower, _LEAST_DAMPING)
+            self.values, self.damping = values, max(damping * slower, _DAMPING.least)
             self.costs.append(after)
-            self.growth = 2.0
             is_near = before - after <= self.near * before
             self.bends = is_near and self.options.loss_scale_px is not None
-        elif self.bends:
-            self.bends, self.near = False, 0.1 * self.near
-        else:
-            self.damping *= self.growth
-            self.growth *= 2.0
-        return predicted, accepted
+            small = before - after <= self.options.cost_tolerance * before
+            return _Told(Ending.COST if small else None)
+        if predicted <= _ROUNDING * before:
+            return _Told(Ending.COST if self.gradient_norm <= _STATIONARY else Ending.STALLED)
+        if not self.bends:
+            return None
+        self.bends, self.near = False, 0.1 * self.near
+        return _Told(None)
 
-    def propose(self) -> tuple[Values, float, float] | None:
+    def propose(self, damping: float) -> tuple[Values, float, float] | None:
         """Return the values after a damped step, the decrease predicted, and the cost; None without one."""
         layout, normal = self.layout, self.normal
         is_large = len(normal.entries) > _MANY_ENTRIES
-        system = eliminate_points(layout, normal, self.damping, self.workers)
+        system = eliminate_points(layout, normal, damping, self.workers)
         if is_large:
             normal.entries = normal.entries[:0].copy()
         steps = self.solve(system)
@@ -368,7 +362,7 @@ class _Run:
         diagonal = np.einsum("naa->na", normal.nodes)
         damped = float(np.sum(diagonal * steps**2) + np.sum(normal.points[:, [0, 3, 5]] * point_steps**2))
         slope = float(np.sum(normal.node_gradients * steps) + np.sum(normal.point_gradients * point_steps))
-        predicted = 0.5 * (self.damping * damped - slope)
+        predicted = 0.5 * (damping * damped - slope)
         values = move(layout, self.values, steps, point_steps)
         if values is None or not math.isfinite(predicted):
             return None
@@ -402,16 +396,16 @@ class _DividedRun(_Run):
 
     def settle(self, values: Values, steps: int) -> tuple[Values, float]:
         """Return values whose points have taken some steps by themselves, and the cost of all at these."""
-        points, cost = self.parts.settle(values, self.how(), steps)
+        points, cost = self.parts.settle(values, self.how(self.damping), steps)
         return replace(values, points=points), cost + self.cost_of_priors(values)
 
-    def how(self) -> Pass:
+    def how(self, damping: float) -> Pass:
         """Return how parts are linearized now."""
-        return Pass(self.options.loss_scale_px, self.least_curvature, self.damping, self.crew.threads_of_task)
+        return Pass(self.options.loss_scale_px, self.least_curvature, damping, self.crew.threads_of_task)
 
     def linearize(self) -> None:
         """Make the damped equations at the best values, and note their gradient."""
-        self.made = self.how()
+        self.made = self.how(self.damping)
         self.total = self.parts.linearize(self.values, self.made)
         self.note_gradient(self.total.largest, largest_share(self.total.curvatures, self.total.gradients))
 
@@ -419,22 +413,23 @@ class _DividedRun(_Run):
         """Give up the equations."""
         del self.total
 
-    def propose(self) -> tuple[Values, float, float] | None:
+    def propose(self, damping: float) -> tuple[Values, float, float] | None:
         """Return the values after a damped step, the decrease predicted, and the cost; None without one."""
-        if self.made.damping != self.damping:  # after a step that was refused
-            self.linearize()
-        total, how = self.total, self.made
+        if self.made.damping != damping:  # after a step that was refused
+            self.made = self.made._replace(damping=damping)
+            self.total = self.parts.linearize(self.values, self.made)
+        total = self.total
         steps = self.solve(total.system(self.layout.active))
         self.factor.give_back()
-        total.diagonal, total.pairs = np.empty((2, 0, 6, 6))
+        total.diagonal, total.pairs = np.empty((2, 0, SLOTS, SLOTS))
         moved = None if steps is None else move(self.layout, self.values, steps, np.zeros(3))
         if steps is None or moved is None:
             return None
         settling = int(self.options.settles_points)
-        points, cost, (damped, slope) = self.parts.step(self.values, moved, steps, how, settling)
+        points, cost, (damped, slope) = self.parts.step(self.values, moved, steps, self.made, settling)
         damped += np.sum(total.curvatures * steps**2)
         slope += np.sum(total.gradients * steps)
-        predicted = float(0.5 * (how.damping * damped - slope))
+        predicted = float(0.5 * (damping * damped - slope))
         if not math.isfinite(predicted):
             return None
         return replace(moved, points=points), predicted, cost + self.cost_of_priors(moved)
