@@ -1,0 +1,114 @@
+"""Matches between the pictures of a report: which fit where the cameras stand, and which contradict that.
+
+A match contradicts if it misses the epipolar lines of its cameras by more than an observation of a 3D point
+may be off; a pair can be set aside and yet have matches that fit, and the other way round.
+"""
+
+from collections.abc import Collection, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray, IntArray, rows_of_parts
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.report.drawing import MAX_PAIRS, Cameras, Pairs
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.matches import MatchBatch, View, rows_of_pairs
+from sfm_shapefit.tracks.structure_options import StructureOptions
+
+MOST_DRAWN = 32
+"""Matches of a pair that are drawn; with more, lines hide the pictures."""
+_MOST_BESIDE = 8  # pairs of a camera that have their matches on the page, which grows by 0.4 kB for each
+_PLACES = 65_535  # steps across a picture in which places are told: two bytes each
+
+
+class PictureMatches(NamedTuple):
+    """Matches of k pairs, m of them drawn, one pair after the other, of each pair those that fit first."""
+
+    pairs: IntArray
+    """(k,) rows of `Pairs`."""
+    counts: IntArray
+    """(k, 2) how many matches fit, and how many contradict."""
+    drawn: IntArray
+    """(k, 2) how many of either are drawn."""
+    places: IntArray
+    """(m, 4) x and y in the picture of the first camera, and in that of the second, of 65,535 steps."""
+
+    def taken(self, chosen: IntArray) -> "PictureMatches":
+        """Return some of the pairs (c,), in that order."""
+        _, rows = rows_of_parts(np.append(0, np.cumsum(self.drawn.sum(axis=1))), chosen)
+        return PictureMatches(self.pairs[chosen], self.counts[chosen], self.drawn[chosen], self.places[rows])
+
+
+def match_pictures(
+    cameras: Cameras, pairs: Pairs, view: View, pictures: Collection[int]
+) -> PictureMatches | None:
+    """Return matches of the pairs that tell most of each camera; None where no two pictures share any.
+
+    Args:
+        cameras, pairs: as they are drawn.
+        view: the matches as the images see them where they are drawn, by the same names.
+        pictures: rows of the cameras that have a picture.
+    """
+    index = {name: k for k, name in enumerate(view.images.names)}
+    image_of = np.array([index.get(name, -1) for name in cameras.names], dtype=np.int64)
+    shown = np.isin(np.arange(len(image_of)), list(pictures)) & cameras.placed & (image_of >= 0)
+    listed = pairs.worst_first()[:MAX_PAIRS]
+    rows = listed[shown[pairs.cameras[listed]].all(axis=1)]
+    ends = image_of[pairs.cameras[rows]]
+    found = [one for batch in view.of_pairs(ends) for one in _of_batch(batch, view, rows, ends)]
+    if not found:
+        return None
+    every, counts, drawn, places = zip(*found, strict=True)
+    told = PictureMatches(np.array(every), np.array(counts), np.array(drawn), np.concatenate(places))
+    return told.taken(_most_telling(told, pairs.cameras[told.pairs], len(image_of)))
+
+
+def _of_batch(
+    batch: MatchBatch, view: View, rows: IntArray, ends: IntArray
+) -> Iterator[tuple[int, list[int], list[int], IntArray]]:
+    """Yield each pair with its row among the `rows`, of which `ends` are the images, counts and places."""
+    misses = _sampson_px(batch, view.images) > StructureOptions().max_reprojection_error_px
+    row_of = rows_of_pairs(batch.pairs, ends)
+    for p, (i, j) in enumerate(batch.pairs.tolist()):
+        own = slice(*batch.offsets[p : p + 2].tolist())
+        counts = [int(np.sum(~misses[own])), int(np.sum(misses[own]))]
+        order = np.argsort(misses[own], kind="stable")  # those that fit come first
+        order = order[np.linspace(0, len(order) - 1, min(len(order), MOST_DRAWN)).round().astype(np.int64)]
+        xy = [
+            view.keypoints(image)[batch.keypoints[own][order, side]] / view.images.sizes_px[image]
+            for side, image in ((0, i), (1, j))
+        ]
+        places = np.concatenate(xy if ends[row_of[p], 0] == i else xy[::-1], axis=1)
+        against = int(np.sum(misses[own][order]))
+        steps = np.clip(np.round(_PLACES * np.nan_to_num(places)), 0, _PLACES).astype(np.int64)
+        yield int(rows[row_of[p]]), counts, [len(order) - against, against], steps
+
+
+def _sampson_px(batch: MatchBatch, images: Images) -> FloatArray:
+    """Return how far matches (M,) are from the epipolar lines, to first order, in pixels of both pictures.
+
+    Cameras at one place have no such lines; their matches have NaN. As `tracks.joining.sampson_px`.
+    """
+    i, j = np.repeat(batch.pairs, np.diff(batch.offsets), axis=0).T
+    baselines = images.centers[j] - images.centers[i]
+    directions = normalized(baselines)
+    along = [np.sum(rays * directions, axis=1) for rays in (batch.rays_i, batch.rays_j)]
+    volumes = np.abs(np.sum(np.cross(batch.rays_i, batch.rays_j) * directions, axis=1))
+    gradients = np.sqrt(np.maximum(2.0 - along[0] ** 2 - along[1] ** 2, 1e-12))
+    return np.asarray(volumes / (gradients * np.repeat(batch.pixel_angles, np.diff(batch.offsets))))
+
+
+def _most_telling(told: PictureMatches, cameras: IntArray, num_cameras: int) -> IntArray:
+    """Return which pairs of cameras (k, 2) to keep: of each camera the first few.
+
+    Pairs most of whose matches contradict come first, then the others; with more matches first.
+    """
+    fit, against = told.counts.T
+    order = np.lexsort((-np.maximum(fit, against), fit >= against))
+    seen, kept = np.zeros(num_cameras, dtype=np.int64), []
+    for p, ends in zip(order.tolist(), cameras[order], strict=True):
+        if (seen[ends] < _MOST_BESIDE).any():
+            kept.append(p)
+        seen[ends] += 1
+    return np.sort(np.array(kept, dtype=np.int64))
