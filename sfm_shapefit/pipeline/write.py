@@ -33,10 +33,13 @@ from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.files.matching_options import MADE_FIRST, SIDECARS
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.matches import Matches
+from sfm_shapefit.tracks.structure_options import StructureOptions
 
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
-    from sfm_shapefit.report.matched import PictureMatches
+    from sfm_shapefit.report.matched import DrawnMatches
 
 Result = TypeVar("Result", bound=LocateResult | GraphResult | MapResult | JoinedModel)
 
@@ -310,25 +313,28 @@ def _write_report(found: Any, page: Path, images: Path | str, out: str = "OUT") 
     return bool(small)
 
 
-def _matches_between(found: Any, drawing: "Drawing", pictures: Collection[int]) -> "PictureMatches | None":
+def _matches_between(found: Any, drawing: "Drawing", pictures: Collection[int]) -> "DrawnMatches | None":
     """Return the matches between pictures, of the database or else of the model's points.
 
     None where there are none, or the database cannot be read any more.
     """
-    from sfm_shapefit.report.matched import match_pictures
+    from sfm_shapefit.report.matched import pick_matches
 
     if isinstance(found, GraphResult):
         return None
     with suppress(ShapeFitError), ExitStack() as stack:
         database = found.facts.inputs.database
         if database and isinstance(found, LocateResult):
-            images, matches = found.placed, open_database(database, found.placed.names)
+            images: Images = found.placed
+            matches: Matches = open_database(database, images.names)
         else:
             model = read_model(found)
             images = model.images
             matches = open_database(database, images.names) if database else TrackMatches(model)
         stack.callback(matches.close)
-        return match_pictures(drawing.cameras, drawing.pairs, matches.at(images), pictures)
+        structure = found.options.structure if isinstance(found, LocateResult) else StructureOptions()
+        limit_px = structure.max_reprojection_error_px
+        return pick_matches(drawing.cameras, drawing.pairs, matches.at(images), pictures, limit_px)
     return None
 
 

@@ -4,25 +4,24 @@ A match contradicts if it misses the epipolar lines of its cameras by more than 
 may be off; a pair can be set aside and yet have matches that fit, and the other way round.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, rows_of_parts
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_of_parts
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.report.drawing import MAX_PAIRS, Cameras, Pairs
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, View, rows_of_pairs
-from sfm_shapefit.tracks.structure_options import StructureOptions
 
 MOST_DRAWN = 32
 """Matches of a pair that are drawn; with more, lines hide the pictures."""
-_MOST_BESIDE = 8  # pairs of a camera that have their matches on the page, which grows by 0.4 kB for each
+_MOST_BESIDE = 8  # pairs of a camera whose matches are on the page; each takes 0.4 kB
 _PLACES = 65_535  # steps across a picture in which places are told: two bytes each
 
 
-class PictureMatches(NamedTuple):
+class DrawnMatches(NamedTuple):
     """Matches of k pairs, m of them drawn, one pair after the other, of each pair those that fit first."""
 
     pairs: IntArray
@@ -34,21 +33,22 @@ class PictureMatches(NamedTuple):
     places: IntArray
     """(m, 4) x and y in the picture of the first camera, and in that of the second, of 65,535 steps."""
 
-    def taken(self, chosen: IntArray) -> "PictureMatches":
+    def taken(self, chosen: IntArray) -> "DrawnMatches":
         """Return some of the pairs (c,), in that order."""
         _, rows = rows_of_parts(np.append(0, np.cumsum(self.drawn.sum(axis=1))), chosen)
-        return PictureMatches(self.pairs[chosen], self.counts[chosen], self.drawn[chosen], self.places[rows])
+        return DrawnMatches(self.pairs[chosen], self.counts[chosen], self.drawn[chosen], self.places[rows])
 
 
-def match_pictures(
-    cameras: Cameras, pairs: Pairs, view: View, pictures: Collection[int]
-) -> PictureMatches | None:
+def pick_matches(
+    cameras: Cameras, pairs: Pairs, view: View, pictures: Collection[int], max_error_px: float
+) -> DrawnMatches | None:
     """Return matches of the pairs that tell most of each camera; None where no two pictures share any.
 
     Args:
         cameras, pairs: as they are drawn.
         view: the matches as the images see them where they are drawn, by the same names.
         pictures: rows of the cameras that have a picture.
+        max_error_px: distance from the epipolar lines, to first order, beyond which a match contradicts.
     """
     index = {name: k for k, name in enumerate(view.images.names)}
     image_of = np.array([index.get(name, -1) for name in cameras.names], dtype=np.int64)
@@ -56,33 +56,35 @@ def match_pictures(
     listed = pairs.worst_first()[:MAX_PAIRS]
     rows = listed[shown[pairs.cameras[listed]].all(axis=1)]
     ends = image_of[pairs.cameras[rows]]
-    found = [one for batch in view.of_pairs(ends) for one in _of_batch(batch, view, rows, ends)]
+    found = []
+    for batch in view.of_pairs(ends):
+        places = rows_of_pairs(batch.pairs, ends)
+        misses = _sampson_px(batch, view.images) > max_error_px
+        for p, place in enumerate(places.tolist()):
+            own = slice(*batch.offsets[p : p + 2].tolist())
+            keypoints = batch.keypoints[own]
+            if ends[place, 0] != batch.pairs[p, 0]:
+                keypoints = keypoints[:, ::-1]
+            found.append((int(rows[place]), *_draw(view, ends[place], keypoints, misses[own])))
     if not found:
         return None
-    every, counts, drawn, places = zip(*found, strict=True)
-    told = PictureMatches(np.array(every), np.array(counts), np.array(drawn), np.concatenate(places))
+    every, counts, drawn, steps = zip(*found, strict=True)
+    told = DrawnMatches(np.array(every), np.array(counts), np.array(drawn), np.concatenate(steps))
     return told.taken(_most_telling(told, pairs.cameras[told.pairs], len(image_of)))
 
 
-def _of_batch(
-    batch: MatchBatch, view: View, rows: IntArray, ends: IntArray
-) -> Iterator[tuple[int, list[int], list[int], IntArray]]:
-    """Yield each pair with its row among the `rows`, of which `ends` are the images, counts and places."""
-    misses = _sampson_px(batch, view.images) > StructureOptions().max_reprojection_error_px
-    row_of = rows_of_pairs(batch.pairs, ends)
-    for p, (i, j) in enumerate(batch.pairs.tolist()):
-        own = slice(*batch.offsets[p : p + 2].tolist())
-        counts = [int(np.sum(~misses[own])), int(np.sum(misses[own]))]
-        order = np.argsort(misses[own], kind="stable")  # those that fit come first
-        order = order[np.linspace(0, len(order) - 1, min(len(order), MOST_DRAWN)).round().astype(np.int64)]
-        xy = [
-            view.keypoints(image)[batch.keypoints[own][order, side]] / view.images.sizes_px[image]
-            for side, image in ((0, i), (1, j))
-        ]
-        places = np.concatenate(xy if ends[row_of[p], 0] == i else xy[::-1], axis=1)
-        against = int(np.sum(misses[own][order]))
-        steps = np.clip(np.round(_PLACES * np.nan_to_num(places)), 0, _PLACES).astype(np.int64)
-        yield int(rows[row_of[p]]), counts, [len(order) - against, against], steps
+def _draw(
+    view: View, images: IntArray, keypoints: IntArray, misses: BoolArray
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return how many matches of two images fit and contradict, of either how many are drawn, and where."""
+    order = np.argsort(misses, kind="stable")  # matches that fit come first
+    order = order[np.linspace(0, len(order) - 1, min(len(order), MOST_DRAWN)).round().astype(np.int64)]
+    places = [
+        view.keypoints(image)[own] / view.images.sizes_px[image]
+        for image, own in zip(images.tolist(), keypoints[order].T, strict=True)
+    ]
+    steps = np.round(_PLACES * np.clip(np.concatenate(places, axis=1), 0.0, 1.0)).astype(np.int64)
+    return np.bincount(misses, minlength=2), np.bincount(misses[order], minlength=2), steps
 
 
 def _sampson_px(batch: MatchBatch, images: Images) -> FloatArray:
@@ -99,7 +101,7 @@ def _sampson_px(batch: MatchBatch, images: Images) -> FloatArray:
     return np.asarray(volumes / (gradients * np.repeat(batch.pixel_angles, np.diff(batch.offsets))))
 
 
-def _most_telling(told: PictureMatches, cameras: IntArray, num_cameras: int) -> IntArray:
+def _most_telling(told: DrawnMatches, cameras: IntArray, num_cameras: int) -> IntArray:
     """Return which pairs of cameras (k, 2) to keep: of each camera the first few.
 
     Pairs most of whose matches contradict come first, then the others; with more matches first.

@@ -39,7 +39,7 @@ from sfm_shapefit.report.charts import (
 )
 from sfm_shapefit.report.drawing import MAX_PAIRS, MAX_POINTS, Drawing, input_centers
 from sfm_shapefit.report.first_screen import banner, scene_name, tiles
-from sfm_shapefit.report.matched import PictureMatches
+from sfm_shapefit.report.matched import DrawnMatches
 from sfm_shapefit.report.sentences import MAX_TEXT, Hint, first_looks, shorten, summary_sentences
 
 _HIGH_TRUST = 0.95  # trust; the chart of trust leaves out cameras above, which need no look
@@ -57,7 +57,7 @@ class Pictures(NamedTuple):
 
     thumbnails: dict[int, str]
     """Data URLs by row of the cameras, as of `read_thumbnails`."""
-    matches: PictureMatches | None = None
+    matches: DrawnMatches | None = None
     """Matches between them; None where there are none at hand."""
 
 
@@ -105,9 +105,10 @@ def page_data(
 ) -> dict[str, Any]:
     """Return everything that the page shows, as JSON values; cameras and pairs stand worst first."""
     trust = drawing.cameras.trust
-    # Cameras of unknown trust come last; of these, those with a reason come first.
-    has_reason = np.array([bool(reason) for reason in drawing.cameras.reasons], dtype=np.bool_)
-    cameras = np.lexsort((~has_reason, np.nan_to_num(trust), np.isnan(trust)))
+    # Cameras of unknown trust come last; where trust is equal, as it is shown, doubted ones come first.
+    every = zip(drawing.cameras.names, drawing.cameras.reasons, strict=True)
+    is_doubted = np.array([bool(reason) or name in facts.verdict.cameras for name, reason in every], np.bool_)
+    cameras = np.lexsort((~is_doubted, np.round(np.nan_to_num(trust), 2), np.isnan(trust)))
     pairs = drawing.pairs.worst_first()[:MAX_PAIRS]
     reasons: dict[str, int] = {"": 0}
     rank = np.empty(len(cameras), dtype=np.int64)
@@ -265,7 +266,7 @@ def _pairs(drawing: Drawing, order: IntArray, rank: IntArray, reasons: dict[str,
     } | {name: pack_array(values[order], "f4") for name, values in columns.items()}
 
 
-def _matches(matches: PictureMatches, listed: IntArray) -> dict[str, Any]:
+def _matches(matches: DrawnMatches, listed: IntArray) -> dict[str, Any]:
     """Return the matches of pairs by their rows on the page, which are those `listed` of the drawing."""
     row_of = {pair: row for row, pair in enumerate(listed.tolist())}
     return {

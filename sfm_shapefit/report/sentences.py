@@ -20,7 +20,7 @@ from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.report.drawing import Drawing, PairClass
 
 MAX_TEXT = 160  # characters of a name or sentence that are shown; strangers may write longer ones
-_OF_PAIRS = "of the pairs contradict"  # of a warning that counts them
+_OF_PAIRS = "of the pairs contradict"  # as a warning says that counts them
 _SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 _FEW_PAIRS = 4  # contradicting pairs; that most are of one camera says nothing where there are fewer
 _HAVE_TABLES = {"intrinsics", "control points", "numbered images"}
@@ -35,6 +35,8 @@ class Hint:
     text: str
     camera: int | None = None
     pair: int | None = None
+    of_several: bool = False
+    """Whether it is said of several cameras, `camera` being the first."""
 
 
 def shorten(text: str, limit: int = MAX_TEXT) -> str:
@@ -68,7 +70,7 @@ def first_looks(drawing: Drawing, facts: Facts) -> list[Hint]:
         return [hint for hint in _warnings(drawing, facts, set()) if _OF_PAIRS not in hint.text]
     cameras = [*_left_out(drawing), *_least_trusted(drawing), *_weak(drawing, facts)]
     warnings = list(_warnings(drawing, facts, {hint.camera for hint in cameras}))
-    told = {hint.camera for hint in [*warnings, *cameras]}
+    told = {hint.camera for hint in [*warnings, *cameras] if not hint.of_several}
     return _one_of_each_camera(
         drawing,
         [
@@ -85,13 +87,13 @@ def _one_of_each_camera(drawing: Drawing, hints: list[Hint]) -> list[Hint]:
     """Return the hints with all that is said of a camera in one, where the first stands."""
     texts: dict[int, list[str]] = {}
     for hint in hints:
-        if hint.camera is not None:
+        if hint.camera is not None and not hint.of_several:
             said = texts.setdefault(hint.camera, [])
             own = f"{shorten(drawing.cameras.names[hint.camera])}: "
             said.append(hint.text.removeprefix(own) if said else hint.text)  # the first names it
     found = []
     for hint in hints:
-        if hint.camera is None:
+        if hint.camera is None or hint.of_several:
             found.append(hint)
         elif lines := texts.pop(hint.camera, None):
             found.append(replace(hint, text="; ".join(lines)))
@@ -144,13 +146,13 @@ def _warnings(drawing: Drawing, facts: Facts, told: set[int | None]) -> Iterator
     evidence = facts.evidence.statements if isinstance(facts, FactsOfModel) else []
     names = {name: row for row, name in enumerate(drawing.cameras.names) if not name.isdigit()}
     for warning in facts.warnings:
-        # The longest name wins, as "11.jpg" is in "111.jpg"; what is said of several leads to none.
+        # The longest name wins, as "11.jpg" is in "111.jpg".
         found = [name for name in names if name in warning]
         rows = [names[one] for one in found if not any(one in name and one != name for name in found)]
-        camera = rows[0] if len(rows) == 1 else None
         if not rows or not told.issuperset(rows) or warning in evidence:
             text = shorten(warning, 2 * MAX_TEXT)
-            yield Hint(text=f"{text[:1].upper()}{text[1:]}", camera=camera)
+            text = text if warning.startswith(tuple(found)) else f"{text[:1].upper()}{text[1:]}"
+            yield Hint(text=text, camera=min(rows, default=None), of_several=len(rows) > 1)
 
 
 def _left_out(drawing: Drawing) -> Iterator[Hint]:

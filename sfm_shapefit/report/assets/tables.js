@@ -57,7 +57,8 @@ const makeTable = (id, kind, total, columns, text, why, onChoice) => {
     const first = page * ROWS_PER_PAGE;
     const last = Math.min(first + ROWS_PER_PAGE, order.length);
     body.replaceChildren(...order.slice(first, last).flatMap(rowOf));
-    shown.textContent = order.length ? `${count(first + 1)}–${count(last)} of ${count(order.length)}${sorted ? "" : ", worst first"}` : "none";
+    shown.textContent = order.length ? `${count(first + 1)}–${count(last)} of ${count(order.length)}` : "none";
+    if (order.length && !sorted) shown.append(element("span", ", worst first", "minor"));
     back.disabled = page === 0;
     next.disabled = last >= order.length;
   };
