@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_of_parts
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.report.drawing import MAX_PAIRS, Cameras, Pairs
 from sfm_shapefit.scene.images import Images
@@ -33,11 +33,6 @@ class DrawnMatches(NamedTuple):
     places: IntArray
     """(m, 4) x and y in the picture of the first camera, and in that of the second, of 65,535 steps."""
 
-    def taken(self, chosen: IntArray) -> "DrawnMatches":
-        """Return some of the pairs (c,), in that order."""
-        _, rows = rows_of_parts(np.append(0, np.cumsum(self.drawn.sum(axis=1))), chosen)
-        return DrawnMatches(self.pairs[chosen], self.counts[chosen], self.drawn[chosen], self.places[rows])
-
 
 def pick_matches(
     cameras: Cameras, pairs: Pairs, view: View, pictures: Collection[int], max_error_px: float
@@ -60,17 +55,15 @@ def pick_matches(
     for batch in view.of_pairs(ends):
         places = rows_of_pairs(batch.pairs, ends)
         misses = _sampson_px(batch, view.images) > max_error_px
-        for p, place in enumerate(places.tolist()):
-            own = slice(*batch.offsets[p : p + 2].tolist())
-            keypoints = batch.keypoints[own]
-            if ends[place, 0] != batch.pairs[p, 0]:
-                keypoints = keypoints[:, ::-1]
+        for place, pair, own in zip(places.tolist(), batch.pairs, batch.slices(), strict=True):
+            keypoints = batch.keypoints[own] if pair[0] == ends[place, 0] else batch.keypoints[own, ::-1]
             found.append((int(rows[place]), *_draw(view, ends[place], keypoints, misses[own])))
     if not found:
         return None
     every, counts, drawn, steps = zip(*found, strict=True)
-    told = DrawnMatches(np.array(every), np.array(counts), np.array(drawn), np.concatenate(steps))
-    return told.taken(_most_telling(told, pairs.cameras[told.pairs], len(image_of)))
+    chosen = _most_telling(np.array(counts), pairs.cameras[list(every)], len(image_of))
+    places = np.concatenate([steps[k] for k in chosen.tolist()])
+    return DrawnMatches(np.array(every)[chosen], np.array(counts)[chosen], np.array(drawn)[chosen], places)
 
 
 def _draw(
@@ -92,22 +85,22 @@ def _sampson_px(batch: MatchBatch, images: Images) -> FloatArray:
 
     Cameras at one place have no such lines; their matches have NaN. As `tracks.joining.sampson_px`.
     """
-    i, j = np.repeat(batch.pairs, np.diff(batch.offsets), axis=0).T
-    baselines = images.centers[j] - images.centers[i]
-    directions = normalized(baselines)
+    baselines = images.centers[batch.pairs[:, 1]] - images.centers[batch.pairs[:, 0]]
+    directions = batch.spread(normalized(baselines))
     along = [np.sum(rays * directions, axis=1) for rays in (batch.rays_i, batch.rays_j)]
     volumes = np.abs(np.sum(np.cross(batch.rays_i, batch.rays_j) * directions, axis=1))
     gradients = np.sqrt(np.maximum(2.0 - along[0] ** 2 - along[1] ** 2, 1e-12))
-    return np.asarray(volumes / (gradients * np.repeat(batch.pixel_angles, np.diff(batch.offsets))))
+    return np.asarray(volumes / (gradients * batch.spread(batch.pixel_angles)))
 
 
-def _most_telling(told: DrawnMatches, cameras: IntArray, num_cameras: int) -> IntArray:
+def _most_telling(counts: IntArray, cameras: IntArray, num_cameras: int) -> IntArray:
     """Return which pairs of cameras (k, 2) to keep: of each camera the first few.
 
-    Pairs most of whose matches contradict come first, then the others; with more matches first.
+    Pairs most of whose matches contradict, by `counts` (k, 2), come first, then the others; with more matches
+    first.
     """
-    fit, against = told.counts.T
-    order = np.lexsort((-np.maximum(fit, against), fit >= against))
+    fit, against = counts.T
+    order = np.lexsort((-counts.max(axis=1), fit >= against))
     seen, kept = np.zeros(num_cameras, dtype=np.int64), []
     for p, ends in zip(order.tolist(), cameras[order], strict=True):
         if (seen[ends] < _MOST_BESIDE).any():
