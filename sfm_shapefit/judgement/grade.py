@@ -106,7 +106,7 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
         Kind.SECOND_OPINION, _without(second.wrong, apart), f"{elsewhere}, which pairs support"
     )
     yield from of_each(Kind.SECOND_OPINION, second.undecided, f"{elsewhere}, and pairs support neither")
-    yield from of_each(Kind.PLACE, places, "pairs agree on another place of it")
+    yield from of_each(Kind.PLACE, places, OTHER_PLACE)
     if lenses:
         clause = f"images contradict {counted(len(lenses), 'focal length')}"
         yield of_model(Kind.LENS, clause, images=through)

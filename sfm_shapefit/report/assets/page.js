@@ -3,7 +3,7 @@
 const drawHead = () => {
   const { banner } = data;
   $("title").textContent = data.title;
-  $("subtitle").textContent = data.subtitle;
+  $("subtitle").textContent = [data.subtitle, data.day].filter(Boolean).join(", ");
   $("banner").dataset.grade = banner.grade;
   $("h-cameras").textContent = `${capital(data.noun)}s`;
   $("h-matrix").textContent = `Which ${data.noun}s are paired`;
