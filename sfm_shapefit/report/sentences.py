@@ -15,6 +15,7 @@ from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.wording import make_printable
 from sfm_shapefit.facts.model import FactsOfModel
 from sfm_shapefit.facts.placed import Facts
+from sfm_shapefit.judgement.grade import OTHER_PLACE
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.report.drawing import Drawing, PairClass
@@ -183,7 +184,9 @@ def _weak(drawing: Drawing, facts: Facts) -> Iterator[Hint]:
         if cameras.reasons[k] and cameras.names[k] in facts.verdict.cameras
     ]
     for row in rows[:_MOST_WEAK]:
-        yield Hint(text=f"{shorten(cameras.names[row])}: {shorten(cameras.reasons[row])}", camera=row)
+        clauses = [one for one in cameras.reasons[row].split("; ") if one != OTHER_PLACE]  # which is told
+        if clauses:
+            yield Hint(text=f"{shorten(cameras.names[row])}: {shorten('; '.join(clauses))}", camera=row)
     if len(rows) > _MOST_WEAK:
         yield Hint(text=f"{len(rows) - _MOST_WEAK:,} more are weak; the table of cameras says why")
 
