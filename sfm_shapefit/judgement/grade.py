@@ -58,12 +58,11 @@ from sfm_shapefit.judgement.limits import (
 from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
-
-OTHER_PLACE = "pairs agree on another place of it"
-"""Said of a camera of `ModelEvidence.places`, which tells more."""
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
 
+OTHER_PLACE = "pairs agree on another place of it"
+"""Said of a camera of `ModelEvidence.places`, which tells more."""
 FEW_PLACED = 1.0 - CHANCE_SHARE  # share of images in the output; below, the model is to be looked at
 
 

@@ -61,8 +61,8 @@ class Pictures(NamedTuple):
     """Matches between them; None where there are none at hand."""
 
 
-class Written(NamedTuple):
-    """When and where a page is written."""
+class Occasion(NamedTuple):
+    """When and where a page is occasion."""
 
     out: str = "OUT"
     """What the next command calls the folder of the model, as the user typed it."""
@@ -71,7 +71,7 @@ class Written(NamedTuple):
     day: str = ""
 
 
-UNKNOWN = Written()
+UNKNOWN = Occasion()
 """Where a page is written that nobody keeps."""
 
 
@@ -80,17 +80,17 @@ def write_report(
     facts: Facts,
     path: Path,
     pictures: Pictures | None = None,
-    written: Written = UNKNOWN,
+    occasion: Occasion = UNKNOWN,
 ) -> None:
     """Write the report of a result; see `report_html`."""
-    path.write_text(report_html(drawing, facts, pictures, written), encoding="utf-8", newline="\n")
+    path.write_text(report_html(drawing, facts, pictures, occasion), encoding="utf-8", newline="\n")
 
 
 def report_html(
-    drawing: Drawing, facts: Facts, pictures: Pictures | None = None, written: Written = UNKNOWN
+    drawing: Drawing, facts: Facts, pictures: Pictures | None = None, occasion: Occasion = UNKNOWN
 ) -> str:
     """Return the page, with pictures if there are some."""
-    data, script = page_data(drawing, facts, pictures, written), _script()
+    data, script = page_data(drawing, facts, pictures, occasion), _script()
     values = {
         "title": html.escape(f"{data['title']} \N{EN DASH} sfm_shapefit"),
         "hashes": f"'sha256-{_hash(script)}'",
@@ -103,7 +103,7 @@ def report_html(
 
 
 def page_data(
-    drawing: Drawing, facts: Facts, pictures: Pictures | None = None, written: Written = UNKNOWN
+    drawing: Drawing, facts: Facts, pictures: Pictures | None = None, occasion: Occasion = UNKNOWN
 ) -> dict[str, Any]:
     """Return everything that the page shows, as JSON values; cameras and pairs stand worst first."""
     trust = drawing.cameras.trust
@@ -120,10 +120,10 @@ def page_data(
     return {
         "title": scene_name(facts),
         "subtitle": _subtitle(facts),
-        "day": written.day,
+        "day": occasion.day,
         "banner": {
             name: shorten(text, 1000)
-            for name, text in banner(drawing, facts, written.out, written.images).items()
+            for name, text in banner(drawing, facts, occasion.out, occasion.images).items()
         },
         "tiles": tiles(drawing, facts),
         "summary": summary_sentences(drawing, facts),
