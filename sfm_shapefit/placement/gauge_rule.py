@@ -31,6 +31,7 @@ SETS_SCALE: dict[ScaleKind, str] = {
     "fixed": "the fixed cameras",
     "rig": "the rigs",
     "control points": "the control points",
+    "scale bars": "the scale bars",
     "distance": "the known distances",
     "prior": "the position priors",
     "input": "the input",
