@@ -190,5 +190,5 @@ def _differentiate(images: Images, points: FloatArray, of: IntArray) -> tuple[Fl
 
 
 def _crossing(vectors: FloatArray) -> FloatArray:
-    """Return the matrices (k, 3, 3) of the products v x ... of vectors (k, 3)."""
+    """Return the matrices (k, 3, 3) that multiply by vectors (k, 3) as the vector product does."""
     return np.asarray(np.cross(vectors[:, None, :], np.eye(3)).transpose(0, 2, 1))

@@ -1,21 +1,24 @@
 """How well a length in a model is known, in the user's unit: for the whole model, and between two places."""
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.place_errors import Distances, PlaceErrors, ScaleErrors
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.display import Displayed, Row, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import rounded
+from sfm_shapefit.facts.scale_bars import ScaleBar
 
 WITHIN_95 = 1.96
 """Standard deviations; between them on either side lie 95 % of a normal distribution."""
 _MOST_PLACES = 100  # points; all distances between as many are looked at
 _NEAREST = 200  # distances, those nearest to the one that is told; their median is no matter of chance
-_ALIGNED = math.cos(math.radians(30.0))  # a direction that is no farther from an axis is named by it
-_STEPS = (1.0, 2.0, 5.0, 10.0)
+_ALIGNED = 0.87  # cosine; a direction within 30 degrees of an axis is named by it
+_STEPS = (1.0, 2.0, 5.0)  # factors of powers of ten; other numbers are not round
 
 
 class Axes(NamedTuple):
@@ -44,11 +47,19 @@ class LengthFacts(Record):
 
     @property
     def statement(self) -> str:
-        """All of it in words."""
+        """All of it in words, of a length that stands for all."""
         along = name_direction(np.array(self.worst_direction), has_up=self.has_up)
         worst = f"worst direction {along} (± {self.said(self.worst_half_width)})"
         within = f"± {self.said(self.half_width)} (95 %)"
         return f"a length of {self.length:g} {self.unit} here is known to {within}, {worst}"
+
+    @property
+    def interval(self) -> str:
+        """The length with its interval, and the worst direction, in words."""
+        along = name_direction(np.array(self.worst_direction), has_up=self.has_up)
+        digits = max(1 - math.floor(math.log10(self.half_width)), 0) if self.half_width > 0.0 else 6
+        within = f"{self.length:.{digits}f} ± {self.half_width:.{digits}f} (95 %)"
+        return f"{within}, worst direction {along} (± {self.worst_half_width:.{digits}f})"
 
     def said(self, half_width: float) -> str:
         """Return half an interval in two digits, of meters in the unit that suits it."""
@@ -56,6 +67,52 @@ class LengthFacts(Record):
             return rounded(half_width, digits=2)
         factor, unit = next((x for x in ((1e3, "mm"), (1e2, "cm")) if half_width * x[0] < 100.0), (1.0, "m"))
         return f"{rounded(factor * half_width, digits=2)} {unit}"
+
+
+class LengthBetween(Record):
+    """How well the distance between two places is known."""
+
+    first: Annotated[str, "Name of an image, or id of a 3D point."]
+    second: Annotated[str, "Name or id of the other place."]
+    length: Annotated[LengthFacts, "The distance."]
+
+
+class LengthsFacts(Record):
+    """What `sfm-shapefit evaluate --json` prints of a model alone."""
+
+    usual: Annotated[
+        LengthFacts | None, "How well a length between its points is known; null where that is not known."
+    ]
+    lengths: Annotated[list[LengthBetween], "The distances that were asked for."]
+    scale_bars: Annotated[tuple[ScaleBar, ...], "Known lengths between points, and those in the model."]
+    scale_sigma: Annotated[
+        float | None,
+        "Relative standard deviation of the scale, which the lengths include; null if not known.",
+    ]
+    warnings: Annotated[list[str], "What the user should know, a sentence each."]
+
+    def told(self) -> list[Row]:
+        """Return what the terminal says."""
+        scale = f"known to {100.0 * (self.scale_sigma or 0.0):.2g} %, included"
+        unknown = "how well it is known is not known, and not included"
+        return [
+            row("lengths", self.usual.statement if self.usual else "how well they are known is not known"),
+            Row("between", [f"{one.first} and {one.second}: {one.length.interval}" for one in self.lengths]),
+            row("scale", unknown if self.scale_sigma is None else scale),
+            Row("scale bars", [one.line for one in self.scale_bars]),
+            Row("warning", self.warnings),
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class LengthEvaluation(Displayed):
+    """How well lengths of a model are known, and how scale bars compare."""
+
+    facts: LengthsFacts
+    """The figures, as they stand in JSON."""
+
+    def _headline(self) -> str:
+        return self.facts.usual.statement if self.facts.usual else "how well lengths are known is not known"
 
 
 def name_direction(direction: FloatArray, *, has_up: bool) -> str:

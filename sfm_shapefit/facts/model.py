@@ -334,6 +334,7 @@ class CheckedFacts(FactsOfModel):
         float | None, "Median number of images that see a 3D point; null if there are none."
     ]
     num_lenses: Annotated[int, "Cameras in COLMAP's sense: lenses of the images with a pose."]
+    scale_bars: Annotated[tuple[ScaleBar, ...], "Known lengths between points, and those in the model."] = ()
     second_opinion: Annotated[str | None, "Folder that has the models of the second opinion, if any."] = None
     images: Annotated[str | None, "Folder of the pictures that were matched for this, if any."] = None
 
@@ -402,7 +403,8 @@ class CheckedFacts(FactsOfModel):
         lines = self.told_lines((int(np.sum(contradicting(pairs) & judged)), int(judged.sum())))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
         notes = Row("warning", [one for one in self.warnings if one not in self.evidence.statements])
-        rows = [Row("weak", weak), row("without a pose", absent), second, notes]
+        bars = row("scale bars", describe_scale_bars(self.scale_bars))
+        rows = [Row("weak", weak), row("without a pose", absent), second, bars, notes]
         return Telling(lines, rows, elsewhere="see the report", step=self.next_step)
 
 

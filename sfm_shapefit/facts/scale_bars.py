@@ -6,10 +6,10 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from sfm_shapefit.adjustment.place_errors import Distances
+from sfm_shapefit.adjustment.scale_bars import BarFit
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded
 from sfm_shapefit.placement.control_points import TriangulatedMarks
-from sfm_shapefit.placement.scale_bars import BarFit
 from sfm_shapefit.scene.given import ScaleBars
 
 _WRONG = 4.0  # standard deviations; a right check bar is no farther off

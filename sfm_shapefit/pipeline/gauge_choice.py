@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_shapefit.adjustment.scale_bars import fit_scale_bars
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import Similarity, mean_rotation_l1
 from sfm_shapefit.facts.control_points import control_rows, control_warnings
@@ -19,9 +20,8 @@ from sfm_shapefit.placement.control_points import (
     fit_control_points,
     triangulate_marks,
 )
-from sfm_shapefit.placement.gauge_rule import say_unused
+from sfm_shapefit.placement.gauge_rule import resized_gauge, say_unused
 from sfm_shapefit.placement.prior_refinement import PULLED
-from sfm_shapefit.placement.scale_bars import bar_gauge, fit_scale_bars
 from sfm_shapefit.scene.given import ControlPoints, Gravity, ScaleBars
 
 
@@ -99,8 +99,10 @@ def _bring_to_scale_bars(state: ModelState, known: ScaleBars) -> ModelState:
     measured = measure_bars(state.images, known, state.estimate, state.inputs.options.structure)
     fit = fit_scale_bars(known, measured.found)
     if fit is not None and not (is_known or state.gauge.scale == "control points"):
-        centers = state.images.centers[state.images.is_posed]
-        state, measured = state.moved(*bar_gauge(state.gauge, known, fit, centers)), measured.in_scale_of(fit)
+        middle = state.images.centers[state.images.is_posed].mean(axis=0)
+        statement = f"scale bars: {known.statement}; {fit.statement}"
+        state = state.moved(*resized_gauge(state.gauge, middle, fit.scale, fit.sigma, statement))
+        measured = measured.in_scale_of(fit)
     else:
         measured = measured._replace(found=measured.found.in_scale(scale_errors(state)))
         if fit is not None:

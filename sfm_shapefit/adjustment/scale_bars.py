@@ -11,15 +11,12 @@ standard deviations of the difference; the worst beyond four has no part, as lon
 contradict one another both count, and the scale is as uncertain as they differ.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.place_errors import Distances, ScaleErrors
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.geometry import Similarity, compose
-from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.scene.given import ScaleBars
 
 _MOST_SIGMAS = 4.0  # standard deviations; bars farther off contradict the others: 1 right bar of 16,000
@@ -39,6 +36,12 @@ class BarFit(NamedTuple):
     NaN for bars that the model lacks, and where there is no other."""
     errors: ScaleErrors
     """Errors of the scale."""
+
+    @property
+    def statement(self) -> str:
+        """How well the bars agree, a clause."""
+        count, of = int(self.used.sum()), int(np.sum(self.used | (np.abs(self.scores) > _MOST_SIGMAS)))
+        return f"{count} of {of} agree, the scale is known to {100.0 * self.sigma:.2g} %"
 
     @property
     def contradict(self) -> bool:
@@ -91,26 +94,6 @@ def _weights(shared: FloatArray, own: FloatArray, chosen: BoolArray) -> FloatArr
 def _variance(shared: FloatArray, own: FloatArray, signs: FloatArray, chosen: BoolArray) -> float:
     """Return the variance of a sum of bars with some signs (b,)."""
     return float(np.sum((signs[chosen] @ shared[chosen]) ** 2) + signs[chosen] ** 2 @ own[chosen])
-
-
-def bar_gauge(before: Gauge, bars: ScaleBars, fit: BarFit, centers: FloatArray) -> tuple[Similarity, Gauge]:
-    """Return the motion of a model with cameras at `centers` (k, 3), whose mean stays, and its gauge then."""
-    middle = centers.mean(axis=0)
-    motion = Similarity(scale=fit.scale, rotation=np.eye(3), translation=(1.0 - fit.scale) * middle)
-    axes = np.eye(3) if before.axes is None else before.axes
-    inner = replace(motion, translation=axes.T @ motion.translation)
-    agree = f"{int(fit.used.sum())} of {int(np.sum(~bars.is_check))} agree"
-    sentence = f"scale bars: {bars.statement}; {agree}, the scale is known to {100.0 * fit.sigma:.2g} %"
-    _, _, others = before.statement.rpartition("; origin")
-    rest = f"origin{others}" if others else "origin and axes: as they were"
-    return motion, replace(
-        before,
-        similarity=compose(inner, before.similarity),
-        scale="scale bars",
-        statement=f"{sentence}; {rest}",
-        scale_statement=sentence,
-        scale_sigma=fit.sigma,
-    )
 
 
 def pooled_noise(errors_px: FloatArray, points: IntArray, noise_px: float) -> float:
