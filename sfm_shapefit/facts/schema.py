@@ -42,8 +42,8 @@ def output_schema() -> dict[str, Any]:
         "title": "Output of sfm-shapefit",
         "description": "Each command prints one object with --json. $defs has the schema of each: locate, "
         "solve_graph (the command place), inspect, evaluate (against a table: evaluate_table; of a model "
-        "alone: evaluate_lengths), check (of several models: check_pieces), map. joined is the locate.json of "
-        "models that map has joined.",
+        "alone: evaluate_lengths), check (of several models: check_pieces), map. joined is the locate.json "
+        "of models that map has joined.",
         "anyOf": [{"$ref": f"#/$defs/{name}"} for name in _COMMANDS],
         "$defs": definitions,
     }

@@ -101,9 +101,9 @@ def length_between(
 def _errors_of(images: Images, points: Points, estimate: Estimate, chosen: IntArray) -> PlaceErrors:
     """Return the errors of some points of a model, by their rows."""
     rows = np.flatnonzero(images.is_posed)
-    lists, observed = rows_of_parts(points.offsets, chosen)
-    of = np.repeat(np.arange(len(chosen)), np.diff(lists))
-    posed, seen = images.part(rows), (of, np.searchsorted(rows, points.images[observed]))
+    observed = points.rows_of(chosen)
+    seen = observed.list_of_rows(), np.searchsorted(rows, points.images[observed.rows])
+    posed = images.part(rows)
     return errors_of_points(posed, draws_at(estimate, posed), points.xyz[chosen], seen, estimate.noise_px)
 
 
