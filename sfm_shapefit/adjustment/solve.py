@@ -4,7 +4,8 @@ import enum
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from sfm_shapefit.adjustment.residuals import (
 )
 from sfm_shapefit.adjustment.schur import eliminate_points, step_points
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.losses import CAUCHY, loss, weighed
@@ -30,7 +32,8 @@ from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
 
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12  # range of mu; rounding drowns what lies beyond
+# Rounding drowns what lies beyond 1e-12 and 1e12.
+_DAMPING = DampingRange(least=1e-12, most=1e12, growth=2.0, acceleration=2.0)
 _LEAST_GAIN = 1e-3  # share of the predicted decrease; a step of less is refused
 _ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in its rounding
 _NEAR = 1e-2  # relative fall of the cost by a step; after less the minimum is near, and the loss may bend
@@ -229,6 +232,12 @@ def linearize_all(
     return normal
 
 
+class _Told(NamedTuple):
+    """What a step that was tried says: a reason to stop, or None to go on from other equations."""
+
+    ending: Ending | None
+
+
 class _Run:
     def __init__(self, problem: AdjustmentProblem, options: AdjustmentOptions) -> None:
         self.problem, self.options = problem, options
@@ -237,7 +246,7 @@ class _Run:
         hand_back_memory()  # what the layout was made of goes before the largest arrays come
         self.factor = choose_solver(problem, self.layout, options, self.workers)
         self.values, cost = self.settle(values_of(problem), _FIRST_SETTLING * options.settles_points)
-        self.damping, self.growth = options.first_damping, 2.0
+        self.damping = options.first_damping
         self.costs = [cost]
         self.gradient_norm, self.iterations = math.inf, 0
         self.bends, self.near = False, _NEAR
@@ -270,50 +279,40 @@ class _Run:
 
     def lower(self, normal: NormalEquations) -> Ending | None:
         """Raise the damping until a step lowers the cost; return a reason to stop, or None to go on."""
-        while True:
-            if self.iterations >= self.options.max_iterations:
-                return Ending.MAX_ITERATIONS
-            before, bent = self.costs[-1], self.bends
-            predicted, accepted = self.attempt(normal)
-            if not accepted and predicted <= _ROUNDING * before:
-                return Ending.COST if self.gradient_norm <= _STATIONARY else Ending.STALLED
-            if accepted:
-                small = before - self.costs[-1] <= self.options.cost_tolerance * before
-                return Ending.COST if small else None
-            if bent:
-                return None
-            if self.damping > _MOST_DAMPING:
-                return Ending.STALLED
+        told, _ = take_damped_step(partial(self.attempt, normal), self.damping, _DAMPING)
+        return Ending.STALLED if told is None else told.ending
 
-    def attempt(self, normal: NormalEquations) -> tuple[float, bool]:
-        """Try one step, take it if it lowers the cost; return the decrease predicted, and whether it did."""
+    def attempt(self, normal: NormalEquations, damping: float) -> "_Told | None":
+        """Try one step, take it if it lowers the cost; None asks for one of more damping."""
+        if self.iterations >= self.options.max_iterations:
+            return _Told(Ending.MAX_ITERATIONS)
         self.iterations += 1
         before = self.costs[-1]
-        proposal = self.propose(normal)
+        proposal = self.propose(normal, damping)
         values, predicted = (self.values, math.inf) if proposal is None else proposal
         values, after = (
             (values, before) if proposal is None else self.settle(values, int(self.options.settles_points))
         )
-        accepted = after < before and before - after >= _LEAST_GAIN * predicted
-        if accepted:
+        if after < before and before - after >= _LEAST_GAIN * predicted:
             gain = (before - after) / predicted if predicted > 0.0 else 1.0
             slower = max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
-            self.values, self.damping = values, max(self.damping * slower, _LEAST_DAMPING)
+            self.values, self.damping = values, max(damping * slower, _DAMPING.least)
             self.costs.append(after)
-            self.growth = 2.0
             is_near = before - after <= self.near * before
             self.bends = is_near and self.options.loss_scale_px is not None
-        elif self.bends:
-            self.bends, self.near = False, 0.1 * self.near
-        else:
-            self.damping *= self.growth
-            self.growth *= 2.0
-        return predicted, accepted
+            small = before - after <= self.options.cost_tolerance * before
+            return _Told(Ending.COST if small else None)
+        if predicted <= _ROUNDING * before:
+            return _Told(Ending.COST if self.gradient_norm <= _STATIONARY else Ending.STALLED)
+        if not self.bends:
+            return None
+        self.bends, self.near = False, 0.1 * self.near
+        return _Told(None)
 
-    def propose(self, normal: NormalEquations) -> tuple[Values, float] | None:
+    def propose(self, normal: NormalEquations, damping: float) -> tuple[Values, float] | None:
         """Return the values after a damped step and the decrease predicted; None if it has no solution."""
         layout, is_large = self.layout, len(normal.entries) > _MANY_ENTRIES
-        system = eliminate_points(layout, normal, self.damping, self.workers)
+        system = eliminate_points(layout, normal, damping, self.workers)
         if is_large:
             normal.entries = normal.entries[:0].copy()
         try:
@@ -332,7 +331,7 @@ class _Run:
         diagonal = np.einsum("naa->na", normal.nodes)
         damped = float(np.sum(diagonal * steps**2) + np.sum(normal.points[:, [0, 3, 5]] * point_steps**2))
         slope = float(np.sum(normal.node_gradients * steps) + np.sum(normal.point_gradients * point_steps))
-        predicted = 0.5 * (self.damping * damped - slope)
+        predicted = 0.5 * (damping * damped - slope)
         values = move(layout, self.values, steps, point_steps)
         return None if values is None or not math.isfinite(predicted) else (values, predicted)
 
