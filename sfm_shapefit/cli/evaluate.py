@@ -16,7 +16,7 @@ from sfm_shapefit.cli.flags import (
     ModelArgument,
     ScaleBarsFile,
     one_path,
-    values_of,
+    split_values,
 )
 from sfm_shapefit.cli.root import app
 
@@ -124,7 +124,7 @@ def _tell_lengths(source: Path, lengths: list[str], bars: Path | None, *, as_jso
         from sfm_shapefit.pipeline.lengths import evaluate_lengths
 
         refuse_absent(source, *filter(None, [bars]))
-        found = evaluate_lengths(source, [values_of("length", one) for one in lengths], scale_bars=bars)
+        found = evaluate_lengths(source, [split_values("length", one) for one in lengths], scale_bars=bars)
         if as_json:
             print_json(found.summary())
         else:

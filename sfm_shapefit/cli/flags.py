@@ -110,22 +110,12 @@ _JOINT = "\0"  # between the values of one flag; no argument of a program can ho
 
 _FIRST_SCREEN = {
     "locate": (
-        *("database", "priors", "control_points", "scale_bars", "known_distance", "fix", "without"),
-        *("rotations", "intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
+        *("database", "priors", "control_points", "known_distance", "fix", "without", "rotations"),
+        *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
     ),
     "map": (
-        *("priors", "control_points", "scale_bars", "known_distance", "gravity", "without"),
-        *(
-            "min_model_size",
-            "join",
-            "intrinsics",
-            "adjust",
-            "scale",
-            "images",
-            "overwrite",
-            "json",
-            "threads",
-        ),
+        *("priors", "control_points", "known_distance", "gravity", "without", "min_model_size", "join"),
+        *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
     ),
     "join": ("database", "adjust", "without", "images", "overwrite", "json"),
     "synth": (
@@ -335,7 +325,7 @@ def _gather_values(args: Sequence[str]) -> list[str]:
     return gathered + waiting
 
 
-def values_of(name: str, text: str) -> tuple[Any, ...]:
+def split_values(name: str, text: str) -> tuple[Any, ...]:
     """Return the values of a repeated flag that `_gather_values` made one."""
     try:
         return tuple(kind(part) for kind, part in zip(_REPEATED[name], text.split(_JOINT), strict=True))
@@ -363,7 +353,7 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
     in_file = _read_toml(config, settings) if config else {}
     flags = {name: value for name, value in given.items() if value is not None and name in known}
     for name in _REPEATED.keys() & flags.keys():
-        flags[name] = tuple(values_of(name, text) for text in flags[name])
+        flags[name] = tuple(split_values(name, text) for text in flags[name])
     flags |= {name: _word_or_number(flags[name]) for name in _WORDS_OR_NUMBERS & flags.keys()}
     try:
         return settings(**in_file | flags)
