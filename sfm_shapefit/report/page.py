@@ -62,7 +62,7 @@ class Pictures(NamedTuple):
 
 
 class Occasion(NamedTuple):
-    """When and where a page is occasion."""
+    """When and where a page is written."""
 
     out: str = "OUT"
     """What the next command calls the folder of the model, as the user typed it."""
@@ -158,6 +158,7 @@ def page_data(
         "lenses": [[shorten(cell) for cell in lens] for lens in drawing.lenses[:_MAX_ROWS]],
         "intrinsics": _cells(facts, "intrinsics", lambda lens: -abs(lens.change)),
         "control": _cells(facts, "control_points", lambda point: -(point.error or 0.0)),
+        "bars": _cells(facts, "scale_bars", lambda bar: -abs(bar.error_sigmas or 0.0)),
         "loops": _cells(facts, "loops", lambda loop: (-loop.num_refused, -loop.num_matches)),
         "pieces": [_piece(k, piece) for k, piece in enumerate(facts.pieces)],
         "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts.timings_s.items()],
