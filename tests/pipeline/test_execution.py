@@ -17,7 +17,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.pair_directions import concatenate
-from sfm_shapefit.pipeline.execution import DaskWorkers, measure_with_workers, workers_of
+from sfm_shapefit.pipeline.execution import DaskWorkers, measure_with_workers
 from tests.adjustment.made import disturb
 from tests.adjustment.test_iterative import make_wall
 from tests.program import run, run_refused
@@ -180,16 +180,27 @@ def test_a_scheduler_without_workers_is_told():
 
 
 class Elsewhere:
-    """A client whose workers are on another machine, where a file is another one."""
+    """A client one of whose workers is on a machine where something is otherwise."""
 
-    def run(self, look, path):
-        here = look(path)
-        return {"tcp://a": here, "tcp://b": here._replace(size=here.size + 1)}
+    def __init__(self, change):
+        self.change = change
+
+    def run(self, look, path, **_options):
+        return {"tcp://a": look(path), "tcp://b": self.change(look(path))}
 
 
-def test_a_worker_that_does_not_see_the_database_is_named():
-    with pytest.raises(WorkerError, match=r"1 worker of 2, tcp://b the first, does not see .*database.db"):
-        workers_of(Elsewhere(), RING_DATABASE)
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda seen: seen._replace(size=seen.size + 1), "does not see .*database.db as it is here; share"),
+        (lambda seen: seen._replace(modified_ns=0), "does not see .*database.db as it is here; share"),
+        (lambda seen: seen._replace(version="0"), "has sfm_shapefit 0; install version"),
+        (lambda _seen: ModuleNotFoundError("sfm_shapefit"), "has no sfm_shapefit; install version"),
+    ],
+)
+def test_a_worker_that_lacks_the_database_or_the_package_is_named_before_anything_is_measured(change, words):
+    with pytest.raises(WorkerError, match=f"the worker tcp://b {words}"):
+        sfm_shapefit.locate(RING_MODEL, RING_DATABASE, client=Elsewhere(change))
 
 
 def test_the_option_before_is_answered(tmp_path):
