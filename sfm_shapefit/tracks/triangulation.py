@@ -162,9 +162,12 @@ def triangulate_matches(
         parts.append((points, RowLists(seen.offsets, rows[seen.rows])))
         is_left = np.ones(len(rows), dtype=np.bool_)
         is_left[seen.rows] = False
-    tracks, points = _concatenate([seen for _, seen in parts]), np.concatenate([own for own, _ in parts])
-    seen = TriangulatedPoints(points=points, tracks=np.arange(len(points)), points_seen=tracks.list_of_rows())
-    return matched.observed(tracks), seen
+    tracks = _concatenate([seen for _, seen in parts])
+    return matched.observed(tracks), TriangulatedPoints(
+        points=np.concatenate([points for points, _ in parts]),
+        tracks=np.arange(len(tracks.offsets) - 1),
+        points_seen=tracks.list_of_rows(),
+    )
 
 
 def _count_images(joined: RowLists, images: IntArray) -> IntArray:
