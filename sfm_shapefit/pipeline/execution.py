@@ -40,7 +40,7 @@ class DaskWorkers(NamedTuple):
 
     def submit(self, work: Callable[..., Answer], *given: Any) -> Any:
         """Return a future of `work(*given)`; what dies with a worker is computed again by another one."""
-        with warnings.catch_warnings():  # of tasks of more than 10 MB, which are few
+        with warnings.catch_warnings():  # dask warns of tasks of more than 10 MB, and few are
             warnings.filterwarnings("ignore", message="Sending large graph")
             return self.client.submit(work, *given, pure=False, retries=_RETRIES)
 

@@ -32,7 +32,7 @@ from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTra
 # Observations between which Python can be interrupted: about 0.1 s.
 _SLICE = 100_000
 _SLICES_A_THREAD = 4  # slices of tracks at least; with one, long tracks would hold up the others
-_JOINED_AT_ONCE = 2_000_000  # observations of matches that are put together at a time, in 100 MB
+_JOINED_AT_ONCE = 2_000_000  # observations whose pixels are put together; they take 100 MB
 _PAIRS = 15  # pairs of observations that are tried for each point; all of six observations
 _STEPS = 5  # Gauss-Newton steps for a point; they begin within the limit of its observations
 _STILL = 1e-9  # length of a step over the distance of the point; the steps end with a shorter one
