@@ -54,6 +54,13 @@ class LengthFacts(Record):
         return f"a length of {self.length:g} {self.unit} here is known to {within}, {worst}"
 
     @property
+    def relative(self) -> str:
+        """All of it in words, as shares of a length, for a model whose scale nothing known set."""
+        along = name_direction(np.array(self.worst_direction), has_up=self.has_up)
+        usual, worst = (100.0 * half / self.length for half in (self.half_width, self.worst_half_width))
+        return f"a length is known to ± {usual:.2g} % (95 %), worst direction {along} (± {worst:.2g} %)"
+
+    @property
     def interval(self) -> str:
         """The length with its interval, and the worst direction, in words."""
         along = name_direction(np.array(self.worst_direction), has_up=self.has_up)
