@@ -21,7 +21,8 @@ from sfm_shapefit.files.colmap.scale_bars import read_scale_bars
 from sfm_shapefit.scene.given import ScaleBars
 from sfm_shapefit.scene.images import Images
 from tests.adjustment.made import ring_problem
-from tests.scenes import RING
+from tests.pipeline.made import keep_few_matches
+from tests.scenes import RING, copied, edit_database
 
 SCALE = 2.5
 BARS = 0.3 * np.array(
@@ -104,6 +105,18 @@ def test_map_takes_them_and_names_a_bar_without_a_mark(ring, tmp_path):
         "known distances were not used for the scale, which is that of the scale bars" in w
         for w in found.models[0].warnings
     )
+
+
+def test_models_that_are_joined_take_the_scale_of_bars_between_them(ring, tmp_path):
+    """Each model shows one end of a bar: images up to the fourth the left one, the others the right one."""
+    database = edit_database(copied(RING, tmp_path) / "database.db", keep_few_matches(4, 6))
+    lines = [one for one in lines_of(ring) if ("right" in one) == (one.split()[4] > "0004.jpg")]
+    found = sfm_shapefit.map_database(database, scale_bars=written(tmp_path, lines), points="never")
+    assert {model.gauge.scale for model in found.models} == {"unit"}
+    (joined,) = found.joined
+    assert sizes(joined.reconstruction) == pytest.approx(SCALE * sizes(ring), rel=1e-3)
+    assert [bar.name for bar in joined.facts.scale_bars] == ["B0", "B1", "B2", "CHK-3"]
+    assert max(abs(bar.error) for bar in joined.facts.scale_bars) < 2e-3
 
 
 def test_where_something_else_sets_the_scale_they_check_it(ring, tmp_path):
