@@ -40,7 +40,8 @@ from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
-_LARGE_FRONT, _STRIP = 768, 256  # rows of a front above the tasks, and columns of its strips
+_LARGE_FRONT = 768  # rows of a front above the tasks; smaller ones give threads too little to share
+_STRIP = 256  # columns; of fewer, products are slower
 
 # What is done with a front, one after the other.
 _ASSEMBLE, _FACTOR, _PASS_ON = range(3)
@@ -195,7 +196,7 @@ def _factor_all(factor: CholeskyFactor, given: _Input) -> tuple[bool, FloatArray
     plan, workers = factor.plan, factor.workers
     memory = FrontMemory(plan, workers.threads)
     units, given = memory.units, given._replace(update_offsets=memory.offsets)
-    stack = np.empty(memory.size * factor.block**2, dtype=factor.dtype)  # of update matrices
+    stack = np.empty(memory.size * factor.block**2, dtype=factor.dtype)  # holds update matrices
     pivots, failed = np.full((len(units), 2), np.inf), np.zeros(len(units), np.bool_)
     is_large, is_shared = _find_large(factor)
 

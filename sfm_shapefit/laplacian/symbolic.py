@@ -468,7 +468,7 @@ def _stack_plan(
 def _stacked(parent: Any, below: Any) -> Any:
     """Place each update matrix on one of two stacks that grow towards each other.
 
-    Those whose parent is beyond the last one, or who have none, are elsewhere.
+    One whose parent is beyond the last supernode, or that has none, is elsewhere.
 
     A front reads its children's updates and writes its own. With the levels of the tree on alternating
     stacks, both are at the top of their stack and nothing is ever copied. Offsets of the second stack
