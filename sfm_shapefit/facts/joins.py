@@ -1,13 +1,15 @@
 """What is said of a model beside another: joined to it, how and how surely, or why not."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from sfm_shapefit.base.geometry import Alignment
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.placement.join import PieceJoin
 from sfm_shapefit.solver.solver_options import Solve
+
+if TYPE_CHECKING:
+    from sfm_shapefit.placement.join import PieceJoin
 
 
 class JoinFacts(Record):
@@ -44,7 +46,7 @@ class JoinOutcome:
     model: int
     to: int
     """The number of the model that it was joined to, or to be joined to."""
-    found: PieceJoin | None
+    found: "PieceJoin | None"
     """The join, refused or not; None if there was none to judge."""
     reason: str = ""
     """Why it was not joined, a clause."""
@@ -54,7 +56,7 @@ class JoinOutcome:
     """Pairs of images that agree on another join."""
 
     @property
-    def join(self) -> PieceJoin | None:
+    def join(self) -> "PieceJoin | None":
         """The join, if it was accepted."""
         return None if self.reason else self.found
 

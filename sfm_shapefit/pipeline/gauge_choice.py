@@ -10,14 +10,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import Similarity, mean_rotation_l1
-from sfm_shapefit.facts.control_points import control_rows, control_warnings
-from sfm_shapefit.files.colmap.control_points import look_at_marks
 from sfm_shapefit.pipeline.state import ModelState
-from sfm_shapefit.placement.control_points import (
-    control_gauge,
-    fit_control_points,
-    triangulate_control_points,
-)
 from sfm_shapefit.placement.gauge_rule import say_unused
 from sfm_shapefit.placement.prior_refinement import PULLED
 from sfm_shapefit.scene.given import ControlPoints, Gravity
@@ -71,6 +64,14 @@ def bring_to_known(state: ModelState) -> ModelState:
 
 
 def _bring_to_control_points(state: ModelState, known: ControlPoints) -> ModelState:
+    from sfm_shapefit.facts.control_points import control_rows, control_warnings  # here: few are given
+    from sfm_shapefit.files.colmap.control_points import look_at_marks
+    from sfm_shapefit.placement.control_points import (
+        control_gauge,
+        fit_control_points,
+        triangulate_control_points,
+    )
+
     moves, resize = not state.inputs.fixed.any(), state.placement.unit is None
     images, options = state.images, state.inputs.options.structure
     triangulated = triangulate_control_points(known, look_at_marks(images, known), options)

@@ -10,10 +10,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.command_options import FIX_SOLVED, Rotations
-from sfm_shapefit.files.colmap.control_points import read_control_points
-from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.placement.gauge_options import GaugeOptions
@@ -42,6 +39,8 @@ def read_known(
 
 
 def _read_priors(images: Images, file: DatabaseFile | None, source: Path | str) -> PositionPriors:
+    from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
+
     if str(source) == PRIORS_OF_DATABASE:
         if file is None:
             raise InputError("there is no database whose priors could be taken; give one (database=FILE)")
@@ -50,6 +49,8 @@ def _read_priors(images: Images, file: DatabaseFile | None, source: Path | str) 
 
 
 def _read_control(images: Images, file: str) -> ControlPoints:
+    from sfm_shapefit.files.colmap.control_points import read_control_points
+
     known = read_control_points(Path(file), images)
     if reason := known.why_too_few():
         raise InputError(f"{file}: {reason}")
@@ -57,6 +58,8 @@ def _read_control(images: Images, file: str) -> ControlPoints:
 
 
 def _read_gravity(images: Images, file: DatabaseFile | None, source: str) -> Gravity:
+    from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
+
     if source != GRAVITY_OF_DATABASE:
         return table_gravity(Path(source), images)
     if file is None:
