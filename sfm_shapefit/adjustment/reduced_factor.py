@@ -75,12 +75,17 @@ def choose_factor(layout: Layout, options: AdjustmentOptions) -> InvertedFactor:
 
 
 def choose_solver(
-    problem: AdjustmentProblem, layout: Layout, options: AdjustmentOptions, workers: Workers
+    problem: AdjustmentProblem,
+    layout: Layout,
+    options: AdjustmentOptions,
+    workers: Workers,
+    *,
+    is_divided: bool = False,
 ) -> ReducedFactor:
-    """Return what the systems of steps are solved with, as the options ask."""
+    """Return what the systems of steps are solved with, as the options ask; iterative where divided."""
     if _is_dense(layout, options):
         return DenseFactor.plan(layout, options.threads)
-    if options.linear_solver == "iterative":
+    if options.linear_solver == "iterative" or (is_divided and options.linear_solver == "auto"):
         from sfm_shapefit.adjustment.iterative_factor import IterativeFactor  # here: few ask for it
 
         return IterativeFactor(problem, layout, workers)

@@ -1,16 +1,14 @@
 """What is told of ground control points: a row for each, warnings, and one sentence on all."""
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
+from sfm_shapefit.placement.control_points import ControlFit, TriangulatedMarks
 from sfm_shapefit.scene.given import ControlPoints
-
-if TYPE_CHECKING:
-    from sfm_shapefit.placement.control_points import ControlFit, TriangulatedControl
 
 
 class ControlPoint(Record):
@@ -41,11 +39,9 @@ class ControlPoint(Record):
         ]
 
 
-def control_rows(
-    known: ControlPoints, found: "TriangulatedControl", fit: "ControlFit | str"
-) -> list[ControlPoint]:
+def control_rows(known: ControlPoints, found: TriangulatedMarks, fit: ControlFit | str) -> list[ControlPoint]:
     """Return the row of each point in locate.json."""
-    fitted = None if isinstance(fit, str) else fit
+    fitted = fit if isinstance(fit, ControlFit) else None
     rows = []
     for k, name in enumerate(known.names):
         own = known.points == k
@@ -69,7 +65,7 @@ def control_rows(
 
 
 def control_warnings(
-    known: ControlPoints, found: "TriangulatedControl", fit: "ControlFit | str", names: Sequence[str]
+    known: ControlPoints, found: TriangulatedMarks, fit: ControlFit | str, names: Sequence[str]
 ) -> Iterator[str]:
     """Yield what is wrong with the points or their marks, a sentence each; `names` are of the images."""
     if isinstance(fit, str):
