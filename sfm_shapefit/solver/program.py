@@ -30,7 +30,7 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 def differences(t: FloatArray, edges: IntArray) -> FloatArray:
     """Return D T, the baselines t_i - t_j, shape (m, d)."""
     baselines = np.empty((len(edges), t.shape[1]))
-    _differences(frozen(t), frozen(edges), baselines)  # of one kind: a kernel is compiled for each
+    _differences(frozen(t), frozen(edges), baselines)  # arrays that can be written cost another compilation
     return baselines
 
 

@@ -11,7 +11,6 @@ from tests.program import run_python
 SCIPY = {"scipy.special", "scipy.linalg", "scipy.sparse", "scipy.spatial"}
 OURS = (
     "rotations.average",
-    "placement.join",
     "placement.diagnosis",
     "adjustment.iterative_factor",
     "files.colmap.priors",
