@@ -84,6 +84,8 @@ _METAVARS: dict[Any, str] = {
     "rotations": "auto|held|free|SIGMA_DEG",
     "config": "FILE",
     "images": "FOLDER",
+    "mask_path": "FOLDER",
+    "rig_config_path": "FILE",
     int: "INTEGER",
     float: "NUMBER",
     int | None: "INTEGER",
