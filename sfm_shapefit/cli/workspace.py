@@ -18,6 +18,7 @@ from sfm_shapefit.cli.flags import (
     read_options,
     takes,
 )
+from sfm_shapefit.cli.forecast import PLANS
 from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.files.undistortion_options import UndistortionOptions
@@ -55,7 +56,7 @@ def workspace_command(
         options = read_options(UndistortionOptions, given)
         from sfm_shapefit.pipeline.workspace import workspace
 
-        with show_progress(not quiet) as progress:
+        with show_progress(not quiet, plan=PLANS["MODEL IMAGES OUT"]) as progress:
             made = workspace(source, folder, target, options=options, progress=progress)
         if not quiet:
             print_lines(made.told)
