@@ -84,7 +84,8 @@ class Course:
             if done == total:  # a stage around this one has ended
                 return
             self._begin(stage, now)
-        elif total != self.total:
+            self.total = 0
+        if total != self.total:
             self.first, self.rated = done, now
         self.done, self.total, self.heard = done, total, now
         self.size = total if stage in _SIZED and total > 1 else self.size
@@ -100,7 +101,7 @@ class Course:
             later = self.plan[self.position + 1 :]
             self.is_as_planned &= stage in later
             self.position = self.plan.index(stage, self.position + 1 if stage in later else 0)
-        self.stage, self.first, self.began, self.rated = stage, 0, now, now
+        self.stage, self.began = stage, now
 
     def _usual(self, stage: str) -> float:
         fixed, more = _USUAL_S.get(stage, (0.0, 0.0))

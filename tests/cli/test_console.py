@@ -101,6 +101,7 @@ def test_the_rest_of_a_run_is_what_is_planned_at_the_rate_so_far():
     rest = 2.0 * (0.5 * 10.02 + 0.2 + 10.0 + 0.15 + 10.0)
     assert course.rest(60.02) == pytest.approx(rest, rel=1e-9)
     assert course.rest(62.02) == pytest.approx(rest - 2.0, rel=1e-9)  # a clock goes on between two reports
+    course.hear("directions", 1, 1, now=70.04)
     course.hear("solve", 0, 1, now=70.04)
     course.hear("solve", 1, 100, now=71.04)  # steps that it may take, not steps that it will
     assert course.counts == ""
