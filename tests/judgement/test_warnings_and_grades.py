@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.facts.warnings import match_warnings, quality_warnings, support_warnings, trust_warnings
+from sfm_shapefit.facts.warnings import match_warnings, quality_warnings, support_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
@@ -51,14 +51,9 @@ def second_configuration(found):
     return replace(found, placement=placement), quality_warnings(placement)
 
 
-def left_out(found):
-    kept = np.arange(8) != 3
-    return replace(found, kept=kept), trust_warnings(found.placement, kept)
-
-
 def unsupported(found):
     told = replace(found, unsupported=np.arange(8) == 3)
-    return told, support_warnings([found.images.names[3]], is_kept=True)
+    return told, support_warnings([found.images.names[3]])
 
 
 def twofold(found, status=DirectionStatus.TWO_MOTIONS):
@@ -71,7 +66,7 @@ def contradicting_rotations(found):
     return twofold(found, DirectionStatus.LOW_INLIER_RATIO)
 
 
-DOUBTS = (uncertain, second_configuration, left_out, unsupported, twofold, contradicting_rotations)
+DOUBTS = (uncertain, second_configuration, unsupported, twofold, contradicting_rotations)
 
 
 @pytest.mark.parametrize("doubt", DOUBTS)
