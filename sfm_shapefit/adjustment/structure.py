@@ -25,6 +25,7 @@ from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import IntArray, hand_back_memory
 from sfm_shapefit.base.executors import Advance, nobody
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points, concatenate_points, number_points
 from sfm_shapefit.tracks.links import ObservedTracks
@@ -81,9 +82,9 @@ def triangulate(
         hand_back_memory()  # before the rays of all keypoints take some
         joined = matched.join(poses, limit_px, threads)
         if limit_px < joining_limits[-1]:  # two keypoints may find a third one in the next joining
-            sizes = np.diff(joined.offsets)
+            sizes = joined.lengths()
         else:  # two keypoints count 2 if they have no other partner, 3 or more if one has
-            sizes = np.diff(np.append(0, np.cumsum(partners[joined.rows]))[joined.offsets])
+            sizes = np.diff(offsets_of(partners[joined.rows])[joined.offsets])
         chosen, is_left = np.flatnonzero(sizes >= fewest), np.ones_like(partners, dtype=np.bool_)
         done = 0
         for own in map(joined.subset, _blocks(chosen)):

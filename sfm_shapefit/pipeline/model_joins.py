@@ -187,7 +187,7 @@ class _Growing:
 def _fitting(tied: TiedPieces, pair: int, worlds: Mapping[int, Similarity]) -> tuple[slice, BoolArray]:
     """Return the matches of a pair, and which of them see, from each side, the point of the other side."""
     ties = tied.ties.matches
-    rows = slice(*ties.offsets[pair : pair + 2].tolist())
+    rows = ties.slice_of(pair)
     off, ends = np.zeros(rows.stop - rows.start), ties.pairs[pair].tolist()
     end_worlds = [worlds[int(tied.cameras.piece_of[v])] for v in ends]
     for way, rays in enumerate((ties.rays_i[rows], ties.rays_j[rows])):

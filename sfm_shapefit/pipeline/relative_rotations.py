@@ -1,6 +1,5 @@
 """`relative_rotations`: those of all pairs of a database's images, by threads or by an executor's workers."""
 
-import itertools
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import closing
@@ -126,9 +125,9 @@ def estimate_near(
     """
     i, j = batch.pairs.T
     turns = np.nan_to_num(rotations[j] @ rotations[i].transpose(0, 2, 1))
-    rays_i, bounds = np.empty_like(batch.rays_i), itertools.pairwise(batch.offsets.tolist())
-    for (first, last), turn in zip(bounds, turns.transpose(0, 2, 1), strict=True):
-        np.matmul(batch.rays_i[first:last], turn, out=rays_i[first:last])
+    rays_i = np.empty_like(batch.rays_i)
+    for own, turn in zip(batch.slices(), turns.transpose(0, 2, 1), strict=True):
+        np.matmul(batch.rays_i[own], turn, out=rays_i[own])
     in_axes_of_j = replace(batch, rays_i=rays_i)
     baselines = estimate_directions(in_axes_of_j, _NEAR, threads).directions
     likely = LikelyPoses(turns, baselines, np.full(len(batch.pairs), _LIKELY))

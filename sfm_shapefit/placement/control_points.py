@@ -18,6 +18,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose, fit_similarity, principal_lengths
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.placement.gauge import Free, Gauge, fit_to_priors
 from sfm_shapefit.scene.given import (
     FEWEST_CONTROL_POINTS,
@@ -70,7 +71,7 @@ def triangulate_control_points(
     """Return where the placed images have control points; marks may be wrong, or off by 4 keypoint errors."""
     counts = np.bincount(control.points[seen.rows], minlength=len(control.names))
     tracks = ObservedTracks(
-        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        offsets=offsets_of(counts),
         cameras=np.arange(len(seen.rows)),
         keypoints=seen.rows,
         pixels=control.pixels[seen.rows],

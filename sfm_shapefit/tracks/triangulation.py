@@ -25,8 +25,9 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.lists import RowLists, offsets_of
 from sfm_shapefit.tracks.joining import write_ray
-from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTracks
 
 # Observations between which Python can be interrupted: about 0.1 s.
 _SLICE = 100_000
@@ -91,7 +92,7 @@ def triangulate_tracks(
     """
     lengths = tracks.lengths()
     seen = np.full(len(tracks.cameras), -1)
-    room = np.append(0, np.cumsum(lengths // max(limits.min_length, 2)))  # for the points of each track
+    room = offsets_of(lengths // max(limits.min_length, 2))  # for the points of each track
     points = np.empty((int(room[-1]), 3))
     track_of = np.empty(len(points), dtype=np.int64)
     figures = np.array(
@@ -149,7 +150,7 @@ def triangulate_matches(
     """
     place = poses, limits, threads
     joined = matched.join(poses, limits.max_error_px, threads)
-    is_chain = np.diff(joined.offsets) > _CHAIN * _count_images(joined, poses.images[matched.cameras])
+    is_chain = joined.lengths() > _CHAIN * _count_images(joined, poses.images[matched.cameras])
     is_left: BoolArray = np.zeros(len(matched.cameras), dtype=np.bool_)
     is_left[joined.subset(np.flatnonzero(is_chain)).rows] = True
     parts = [_triangulate_joined(matched, joined.subset(np.flatnonzero(~is_chain)), *place)]
@@ -157,11 +158,11 @@ def triangulate_matches(
     for limit_px in joining_limits_px(threshold_px, limits.max_error_px) if is_chain.any() else ():
         left, rows = left.among(is_left), rows[is_left]
         points, seen = _triangulate_joined(left, left.join(poses, limit_px, threads), *place)
-        parts.append((points, JoinedRows(seen.offsets, rows[seen.rows])))
+        parts.append((points, RowLists(seen.offsets, rows[seen.rows])))
         is_left = np.ones(len(rows), dtype=np.bool_)
         is_left[seen.rows] = False
-    lengths = np.concatenate([np.diff(seen.offsets) for _, seen in parts])
-    tracks = JoinedRows(np.append(0, np.cumsum(lengths)), np.concatenate([seen.rows for _, seen in parts]))
+    lengths = np.concatenate([seen.lengths() for _, seen in parts])
+    tracks = RowLists(offsets_of(lengths), np.concatenate([seen.rows for _, seen in parts]))
     every = np.arange(len(lengths))
     return matched.observed(tracks), TriangulatedPoints(
         points=np.concatenate([points for points, _ in parts]),
@@ -170,7 +171,7 @@ def triangulate_matches(
     )
 
 
-def _count_images(joined: JoinedRows, images: IntArray) -> IntArray:
+def _count_images(joined: RowLists, images: IntArray) -> IntArray:
     """Return how many images the keypoints of each track are of, whose own images (K,) ascend."""
     own, is_new = images[joined.rows], np.ones(len(joined.rows), dtype=np.int64)
     is_new[1:] = own[1:] != own[:-1]
@@ -179,11 +180,11 @@ def _count_images(joined: JoinedRows, images: IntArray) -> IntArray:
 
 
 def _triangulate_joined(
-    matched: MatchedKeypoints, joined: JoinedRows, poses: CameraPoses, limits: PointLimits, threads: int
-) -> tuple[FloatArray, JoinedRows]:
+    matched: MatchedKeypoints, joined: RowLists, poses: CameraPoses, limits: PointLimits, threads: int
+) -> tuple[FloatArray, RowLists]:
     """Return the points (k, 3) of joined keypoints, and the rows that see each."""
     found = triangulate_tracks(matched.observed(joined), poses, limits, threads)
-    return found.points, joined.of_points(found.points_seen)
+    return found.points, joined.of(RowLists.by_label(found.points_seen))
 
 
 @inner_kernel

@@ -77,7 +77,7 @@ class UnposedImages:
                 images=ImageRecords(
                     every.ids[rows], every.camera_ids[rows], np.searchsorted(ids, of_image), names
                 ),
-                starts=np.zeros(len(rows) + 1, dtype=np.int64),
+                offsets=np.zeros(len(rows) + 1, dtype=np.int64),
             )
         )
 

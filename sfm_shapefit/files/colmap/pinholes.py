@@ -349,12 +349,11 @@ def _add_points(
     made: pycolmap.Reconstruction, image_ids: IntArray, points: Points, colors: npt.NDArray[np.uint8]
 ) -> None:
     """Add points to a model; their observations index its images (i,) by these ids."""
-    bounds = itertools.pairwise(points.offsets.tolist())
     seen = list(zip(image_ids[points.images].tolist(), points.keypoints.tolist(), strict=True))
-    for point_id, (begin, end), xyz, color in zip(
-        points.ids.tolist(), bounds, points.xyz, colors, strict=True
+    for point_id, own, xyz, color in zip(
+        points.ids.tolist(), points.slices(), points.xyz, colors, strict=True
     ):
-        add_point(made, point_id, xyz, color, seen[begin:end])
+        add_point(made, point_id, xyz, color, seen[own])
 
 
 def _sensor_id(camera_id: int) -> pycolmap.sensor_t:

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.base.paths import refuse_irregular_file
 from sfm_shapefit.files.colmap import model_arrays
 from sfm_shapefit.files.colmap.binary_records import (
@@ -145,7 +146,7 @@ def read_files(files: ModelFiles) -> tuple[ModelArrays, tuple[str, ...]]:
     images = _read_images(files, set(cameras))
     heads = ImageRecords(images.ids, images.camera_ids, images.ids, images.names)
     model = ModelArrays.alone(lenses, heads, images.poses, frozenset())
-    model = replace(model, starts=images.starts, points2d=images.points2d)
+    model = replace(model, offsets=images.offsets, points2d=images.points2d)
     if files.has("rigs"):
         rigs = _read_rigs(files, set(cameras))
         frames, taken = _read_frames(files, rigs)
@@ -272,7 +273,7 @@ class _Images(NamedTuple):
     camera_ids: IntArray
     names: tuple[str, ...]
     poses: FloatArray
-    starts: IntArray
+    offsets: IntArray
     points2d: Records
 
 
@@ -316,7 +317,7 @@ def _read_images(files: ModelFiles, camera_ids: set[int]) -> _Images:
         camera_ids=table[:, 7].astype(np.int64),
         names=tuple(called[i] for i in ids),
         poses=table[:, :7],
-        starts=np.append(0, np.cumsum(ends - begins)),
+        offsets=offsets_of(ends - begins),
         points2d=points2d,
     )
 
@@ -427,12 +428,12 @@ def _with_points(files: ModelFiles, model: ModelArrays) -> ModelArrays:
             raise InputError(f"{called}: 3D point {point} has coordinates that are not finite")
         rows = np.searchsorted(model.images.ids, elements[:, 0])
         is_there = np.append(model.images.ids, -1)[rows] == elements[:, 0]
-        is_there &= elements[:, 1] < np.append(np.diff(model.starts), 0)[rows]
+        is_there &= elements[:, 1] < np.append(model.lengths(), 0)[rows]
         if not is_there.all():
             image_id, keypoint = elements[~is_there][0].tolist()
             reference = f"a track refers to point {keypoint} of image {image_id}"
             raise ContradictionError(f"{called}: {reference}, which {files.beside('images')} does not have")
-        other = _observe(model, heads, model.starts[rows] + elements[:, 1])
+        other = _observe(model, heads, model.offsets[rows] + elements[:, 1])
         if other and not contradiction:
             k, point, owner = other
             reference = (
@@ -503,7 +504,7 @@ def _refuse_unknown_points(files: ModelFiles, model: ModelArrays) -> None:
         unknown = point_ids[np.searchsorted(point_ids, some)] != some
         if unknown.any():
             k = int(np.argmax(unknown))
-            image_id = model.images.ids[np.searchsorted(model.starts, begin + k, side="right") - 1]
+            image_id = model.images.ids[np.searchsorted(model.offsets, begin + k, side="right") - 1]
             raise ContradictionError(
                 f"{files.called_as('images')}: image {image_id} observes 3D point {some[k]}, which "
                 f"{files.beside('points3D')} does not have"
