@@ -3,7 +3,6 @@
 Twelve cameras with a direction for every pair, one of them, or one pair, changed for the worse.
 """
 
-
 import numpy as np
 import pytest
 

@@ -65,7 +65,7 @@ class JoinOutcome:
         named = first_of([f"{a} and {b}" for a, b in self.rivals])
         if join is None:
             return f"{own} is not joined to {other}: {self.reason}" + (f" ({named})" if named else "")
-        rival = f"; {counted(len(self.rivals), 'pair')} would have it elsewhere ({named})" if named else ""
+        rival = f"; {counted(len(self.rivals), 'pair')} put it elsewhere ({named})" if named else ""
         return (
             f"{own} is joined to {other} by {join.evidence}: scale known to "
             f"{100.0 * join.scale_sigma:.2g} %, turn to {join.turn_sigma_deg:.2g} deg, its cameras to "

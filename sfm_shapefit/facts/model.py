@@ -173,7 +173,7 @@ class FactsOfModel(Facts):
         contradict = (
             f"{against[0]:,} of {counted(against[1], 'pair')} contradict{'s' * (against[1] == 1)} the result"
         )
-        contradict = contradict if against[1] else "no pair says where cameras stand"
+        contradict = contradict if against[1] else "no pair determines where cameras are"
         silent = self.num_pairs - against[1]
         if silent > against[1] > 0:
             contradict += f", and {silent:,} of {self.num_pairs:,} pairs say nothing of it"
