@@ -44,6 +44,17 @@ def drawn(tmp_path_factory) -> tuple[RenderedScene, Path]:
 
 
 @pytest.fixture(scope="session")
+def dask_client():
+    """A client of two workers, threads of this process; it stands in for a cluster."""
+    distributed = pytest.importorskip("distributed")
+    local = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address="127.0.0.1:0"
+    )
+    with local, distributed.Client(local, set_as_default=False) as client:
+        yield client
+
+
+@pytest.fixture(scope="session")
 def ring_located() -> sfm_shapefit.LocateResult:
     """What `locate` makes of the ring; nobody may change it."""
     return sfm_shapefit.locate(RING / "sparse" / "0")

@@ -76,12 +76,17 @@ def choose_factor(layout: Layout, options: AdjustmentOptions) -> InvertedFactor:
 
 
 def choose_solver(
-    problem: AdjustmentProblem, layout: Layout, options: AdjustmentOptions, workers: Workers
+    problem: AdjustmentProblem,
+    layout: Layout,
+    options: AdjustmentOptions,
+    workers: Workers,
+    *,
+    is_divided: bool = False,
 ) -> ReducedFactor:
-    """Return what the systems of steps are solved with, as the options ask."""
+    """Return what the systems of steps are solved with, as the options ask; iterative where divided."""
     if _is_dense(layout, options):
         return DenseFactor.plan(layout, options.threads)
-    if options.linear_solver == "iterative":
+    if options.linear_solver == "iterative" or (is_divided and options.linear_solver == "auto"):
         return IterativeFactor(problem, layout, workers)
     return SparseFactor.of(layout, options.threads, np.float32)
 

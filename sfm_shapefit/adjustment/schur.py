@@ -49,8 +49,7 @@ def eliminate_points(
     layout: Layout, normal: NormalEquations, damping: float, workers: Workers
 ) -> ReducedSystem:
     """Return the reduced system, each diagonal entry of the full one raised by the factor 1 + damping."""
-    inverses = np.empty_like(normal.points)
-    _invert(normal.points, damping, inverses)
+    inverses = invert_points(normal, damping)
     diagonal = normal.nodes.copy()
     entries = np.einsum("naa->na", diagonal)
     entries *= 1.0 + damping
@@ -68,6 +67,13 @@ def eliminate_points(
 
     workers.share(layout.first_of_node, work, _ENTRIES_WORTH_A_THREAD)
     return ReducedSystem(diagonal=diagonal, pairs=pairs, right=right, inverses=inverses)
+
+
+def invert_points(normal: NormalEquations, damping: float) -> FloatArray:
+    """Return the inverses (k, 6) of the points' blocks, damped; packed as these."""
+    inverses = np.empty_like(normal.points)
+    _invert(normal.points, damping, inverses)
+    return inverses
 
 
 def step_points(

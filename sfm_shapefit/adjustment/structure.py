@@ -11,7 +11,7 @@ from matches fit better here: on fountain-P11, Herz-Jesus-P25, castle-P30 and le
 and 4.3 % more observations, with mean errors of 0.44 instead of 0.53, 0.58 (0.71), 0.41 (0.51) and 0.47 px
 (0.65). The mean length of tracks is 4.60 (4.54), 5.64 (5.54), 4.91 (4.95) and 4.59 (4.66).
 
-No sample is random: the same input gives the same bits. An executor's workers have no part in it: to send
+No sample is random: the same input gives the same bits. The workers of a cluster have no part in it: to send
 them the tracks takes as long as they would save.
 
 Source: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016, section 4.3.

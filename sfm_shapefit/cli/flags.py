@@ -45,20 +45,12 @@ PriorsFile = Annotated[
 ]
 
 
-def _check_executor(name: str) -> str:
-    if not re.fullmatch("serial|processes|dask(:.+)?", name):
-        raise typer.BadParameter(f"{name!r} is not one of serial, processes, dask, dask:ADDRESS")
-    return name
-
-
-ExecutorName = Annotated[
+Scheduler = Annotated[
     str,
     typer.Option(
-        "--executor",
-        metavar="serial|processes|dask[:ADDRESS]",
-        callback=_check_executor,
-        help="Where pairs are measured: in this process, in as many others as --threads says, or on a "
-        "cluster of dask, started here or that of a running scheduler's address.",
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Address of a dask scheduler, whose workers share the work; see docs/distributed.md.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
@@ -390,7 +382,7 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
 
 def _describe_unknown(name: str, known: Sequence[str]) -> str:
     """Say what a key is that this command does not know: a flag, another command's, or a typo."""
-    if name in {"database", "priors", "executor", *homes_of(OutputFlags)}:
+    if name in {"database", "priors", "scheduler", *homes_of(OutputFlags)}:
         return f"is no key of a file; give it as a flag: {_flag_of(name)}"
     others = _commands_with(name)
     return f"is an option of {others}" if others else f"is no option; {hint(name, known)}"

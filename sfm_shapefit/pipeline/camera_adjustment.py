@@ -73,8 +73,8 @@ def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
     if source.fixed is not None:  # points that fixed images alone see move nothing
         links = links_touching(start, links, ~source.fixed[rows])
     freedom = replace(state.freedom_of(rows), pull_rad=state.inputs.pull_rad)
-    given = state.given_poses(rows)
-    adjusted = adjust_placement(begin(start, links, options.structure, freedom, given, clock.threads))
+    given, crew = state.given_poses(rows), state.crew_of(clock)
+    adjusted = adjust_placement(begin(start, links, options.structure, freedom, given, crew))
     del links
     similarity, centers = state.frame.similarity, np.empty((images.num_images, 3))
     centers[rows] = adjusted.images.centers

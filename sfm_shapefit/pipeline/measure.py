@@ -69,7 +69,7 @@ def measure(
 
     Pairs of two fixed images are left out.
 
-    Workers of an executor estimate the directions of a database's pairs; what is wanted beside takes a second
+    Workers of a cluster estimate the directions of a database's pairs; what is wanted beside takes a second
     pass then.
 
     Raises:
@@ -77,7 +77,7 @@ def measure(
     """
     beside = SideResults(source, options.inlier_threshold_px, wanted, clock.threads)
     without = source.pairs_of_fixed
-    if clock.executor is not None and source.has_database:
+    if clock.cluster is not None and source.has_database:
         parts = measure_with_workers(source.view, partial(estimate_directions, options=options), clock)
         if without is not None and parts:
             every = concatenate(parts)

@@ -36,6 +36,7 @@ _SAMPLES = 96  # samples of each direction's error; two numbers each, see `judge
 _BLOCK = 9  # entries of a block of the factor; three coordinates by three
 _OBSERVATIONS_OF_A_MATCH = 0.7  # observations for a match, if keypoints are more; .45 to .66 measured
 _OBSERVATION_BYTES = 420.0  # bytes of an observation; its track, and its part of the normal equations
+_DIVIDED_BYTES = 270.0  # the same where adjustments are divided: a part has normal equations at a time
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000  # unknowns of an adjusted camera; up to as many, their system is dense
 
 
@@ -161,7 +162,8 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
     seeded = throughout + kept + 300.0 * work.num_edges + tracks
     if work.adjusts_bundle or (work.adjusts and plan.adjustment):
         observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches)
-        adjusting = _OBSERVATION_BYTES * observations + _adjusted_cameras_bytes(work)
+        size = _DIVIDED_BYTES if plan.divides else _OBSERVATION_BYTES
+        adjusting = size * observations + _adjusted_cameras_bytes(work)
         peaks["adjusting"] = seeded + adjusting
     peaks["triangulating"] = seeded - rays
     return peaks

@@ -32,7 +32,7 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table, contradicting
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -235,7 +235,7 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
     named = [one for one in state.reasons if one.of_each and one.kind is not Kind.SECOND_OPINION]
     cameras = _camera_rows(model, fits, [*state.weak, *(one for one in named if one not in state.weak)])
     residuals_deg = pairs.columns["residual_deg"]
-    error_deg = _median(residuals_deg[np.isfinite(residuals_deg)].tolist())
+    error_deg = _median(residuals_deg[np.isfinite(residuals_deg) & ~contradicting(pairs)].tolist())
     errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
     facts = CheckedFacts(
         inputs=source.inputs.facts,

@@ -90,7 +90,7 @@ def adjust_first_placement(
                 placed.read_links(start, clock.advance),
                 options.structure,
                 placed.freedom_of(rows),
-                threads=clock.threads,
+                crew=placed.crew_of(clock),
             ),
             lenses_wanted=lenses_wanted,
             rotations_known=rotations_known,

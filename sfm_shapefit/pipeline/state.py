@@ -9,7 +9,8 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.executors import Advance
+from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.base.executors import Advance, Crew
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
@@ -176,6 +177,10 @@ class ModelState:
         rotations = None if self.adjustment is None else images.frames.rotations
         given = GivenPoses(rotations, self.inputs.fixed_frames, self.held)
         return given.of(np.unique(images.frame_of[rows]))
+
+    def crew_of(self, clock: Clock) -> Crew:
+        """Return who works, and how for memory."""
+        return replace(clock.crew, divides=self.source.memory_plan.divides)
 
     def pictures(self, images: Images, rows: IntArray) -> ModelKeypoints:
         """Return the keypoints of some images (r,), and their lenses."""

@@ -14,11 +14,13 @@ as good as the turns, so that a robust refinement moves all seven unknowns, its 
 in steps.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, normalized
 from sfm_shapefit.base.losses import CAUCHY, loss, weighed
@@ -37,8 +39,12 @@ _LEAST_LENGTH = 1e-6  # share of the median; ends that nearly coincide would hav
 _SCALES_PX = (32.0, 8.0, 2.0)  # pixels; a turn off by half a degree is 13 to 29 of them
 _STEPS = 10  # Gauss-Newton steps at each scale; most scales settle in fewer
 _SETTLED = 1e-5  # share of the cost; steps that lower it by less end a scale
+# Shares of the diagonal; a refused step is a matter of the loss, and far less of it helps.
+_DAMPING = DampingRange(first=1e-6, least=0.0, most=1.0, growth=100.0)
 _SHIFT = 1e-6  # step of an unknown that tells its derivative; larger ones bend, smaller ones are rounding
 _EFFECTIVE = 10.0  # matches that count of a pair; its errors are common to all of them
+
+_Linearized = tuple[float, FloatArray, FloatArray]
 
 
 class Standing(NamedTuple):
@@ -254,26 +260,34 @@ def refine_pieces(cameras: PieceCameras, ties: PieceTies, standing: Standing) ->
     held = np.zeros((len(sizes), 7), dtype=np.bool_)
     held[0] = True
     held[:, 3] |= ~free
-    hessian = np.zeros((7 * len(sizes), 7 * len(sizes)))
     for scale in _SCALES_PX:
-        damping = 1e-6
-        cost, hessian, slope = _linearize(residuals, standing, sizes, weights, scale)
+        system, damping = _linearize(residuals, standing, sizes, weights, scale), _DAMPING.first
         for _ in range(_STEPS):
-            moved = _moved(standing, -_solve(hessian, slope, held.ravel(), damping), sizes)
-            then = _linearize(residuals, moved, sizes, weights, scale)
-            if not then[0] < cost:
-                damping *= 100.0
-                if damping > 1.0:
-                    break
-                continue
-            settled = cost - then[0] < _SETTLED * cost
-            standing, (cost, hessian, slope), damping = moved, then, damping / 10.0
-            if settled:
+            propose = partial(_propose, (residuals, sizes, weights, scale), standing, system, held.ravel())
+            moved, damping = take_damped_step(propose, damping, _DAMPING)
+            if moved is None:
+                break
+            before, (standing, system) = system[0], moved
+            if before - system[0] < _SETTLED * before:
                 break
     _, hessian, _ = _linearize(
         residuals, standing, sizes, np.minimum(_EFFECTIVE / counts, 1.0), _SCALES_PX[-1]
     )
     return standing, _covariances(hessian, held)
+
+
+def _propose(
+    problem: tuple[Residuals, FloatArray, FloatArray, float],
+    standing: Standing,
+    system: _Linearized,
+    held: BoolArray,
+    damping: float,
+) -> tuple[Standing, _Linearized] | None:
+    """Return where a damped step leads, and what `_linearize` says there; None if the cost is not lower."""
+    residuals, sizes, weights, scale = problem
+    moved = _moved(standing, -_solve(*system[1:], held, damping), sizes)
+    then = _linearize(residuals, moved, sizes, weights, scale)
+    return (moved, then) if then[0] < system[0] else None
 
 
 def _solve(hessian: FloatArray, slope: FloatArray, held: BoolArray, damping: float) -> FloatArray:
@@ -309,7 +323,7 @@ def _moved(standing: Standing, step: FloatArray, sizes: FloatArray) -> Standing:
 
 def _linearize(
     residuals: Residuals, standing: Standing, sizes: FloatArray, weights: FloatArray, scale: float
-) -> tuple[float, FloatArray, FloatArray]:
+) -> _Linearized:
     """Return the Cauchy cost, and Hessian (7 G, 7 G) and slope (7 G,) of its reweighted squares."""
     first, second = (Standing(*(part[ends] for part in standing)) for ends in residuals.pieces.T)
     now = residuals.at(first, second)

@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread, tangent_bases
 from sfm_shapefit.base.jit import inner_kernel, kernel
@@ -45,7 +46,6 @@ from sfm_shapefit.laplacian.factor import (
     analyze,
 )
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
-from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
 from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor, predict_factor
 

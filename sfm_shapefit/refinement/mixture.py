@@ -51,6 +51,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import tangent_bases
 from sfm_shapefit.base.jit import kernel
@@ -59,7 +60,6 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.laplacian.factor import FactorPlan, allocate_factor
 from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.refinement.length_prior import LengthPrior
-from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
 
 _LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction

@@ -197,8 +197,8 @@ class MatchPart(Protocol):
     def num_pairs(self) -> int:
         """Number of pairs."""
 
-    def open(self) -> AbstractContextManager["View"]:
-        """Open the file again, for a view of the same images and these pairs, which are read once."""
+    def open(self, images: Images) -> AbstractContextManager["View"]:
+        """Open the file again, for a view of the same images and of these pairs, which are read once."""
 
 
 class View:

@@ -784,7 +784,7 @@ def test_one_keypoint_that_is_not_finite_costs_its_matches(path, model, bits):
         assert np.isfinite(view.keypoints(1)).all()
         assert view.keypoints(1)[0].tolist() == [0.0, 0.0]
         for part in view.parts(50):  # other processes leave the same aside
-            with part.open() as opened:
+            with part.open(model.images) as opened:
                 assert found.items() >= as_sets(opened.batches()).items()
     lost = {
         pair: {match for match in found if match[pair.index(1)] == 0}
