@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.evaluate import evaluate as evaluate
     from sfm_shapefit.pipeline.inspect import inspect as inspect
     from sfm_shapefit.pipeline.join import join as join
+    from sfm_shapefit.pipeline.lengths import evaluate_lengths as evaluate_lengths
     from sfm_shapefit.pipeline.locate import locate as locate
     from sfm_shapefit.pipeline.map import map_database as map_database
     from sfm_shapefit.pipeline.match import match_images as match_images
@@ -93,6 +94,7 @@ _HOMES = {
     "pipeline.evaluate": ("evaluate",),
     "pipeline.inspect": ("inspect",),
     "pipeline.join": ("join",),
+    "pipeline.lengths": ("evaluate_lengths",),
     "pipeline.locate": ("locate",),
     "pipeline.map": ("map_database",),
     "pipeline.match": ("match_images",),

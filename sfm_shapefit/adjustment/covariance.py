@@ -173,8 +173,8 @@ class GroundedSystem:
         return nodes
 
     def by_frame(self, blocks: FloatArray) -> FloatArray:
-        """Put blocks of the nodes (N, 3, 3) in the places of their frames: 0 if fixed, NaN if unseen."""
-        found = np.zeros((len(self.unseen), 3, 3))
+        """Put blocks of the nodes (N, ...) in the places of their frames: 0 if fixed, NaN if unseen."""
+        found = np.zeros((len(self.unseen), *blocks.shape[1:]))
         moves = self.layout.node_of_frame >= 0
         found[moves] = blocks[self.layout.node_of_frame[moves]]
         found[self.unseen] = np.nan

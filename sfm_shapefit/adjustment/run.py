@@ -298,6 +298,8 @@ class AdjustmentRun:
             freedom=self.freedom,
             errors=errors,
             covariances=covariances,
+            draws=None if known is None else known.draws,
+            noise_px=math.nan if known is None else known.noise_px,
             lens_errors=None if known is None else known.lens_errors,
             scale_sigma=None if known is None else known.scale_sigma,
             focal_sigmas=run.focal_sigmas,

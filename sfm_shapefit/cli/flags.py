@@ -66,6 +66,13 @@ ImageFolder = Annotated[
     ),
 ]
 
+ScaleBarsFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--scale-bars", metavar="FILE", help="Known lengths between points, as of `locate`, to compare with."
+    ),
+]
+
 _ALSO = {"quiet": "-q", "verbose": "-v", "images": "--image_path"}
 
 _METAVARS: dict[Any, str] = {
@@ -73,6 +80,8 @@ _METAVARS: dict[Any, str] = {
     "fix": "FILE|solved",
     "without": "FILE",
     "control_points": "FILE",
+    "scale_bars": "FILE",
+    "length": "PLACE PLACE",
     "gravity": "FILE|database",
     "rotations": "auto|held|free|SIGMA_DEG",
     "config": "FILE",
@@ -86,7 +95,7 @@ _METAVARS: dict[Any, str] = {
 }
 """Placeholder of a flag's value in the help, by the field's name or else by its type."""
 
-_REPEATED = {"known_distance": (str, str, float)}
+_REPEATED = {"known_distance": (str, str, float), "length": (str, str)}
 """Repeatable flags of several values, which typer has no way to declare, and the types of these values."""
 
 _WORDS_OR_NUMBERS = {"rotations"}
@@ -311,7 +320,7 @@ def _gather_values(args: Sequence[str]) -> list[str]:
     return gathered + waiting
 
 
-def _values_of(name: str, text: str) -> tuple[Any, ...]:
+def split_values(name: str, text: str) -> tuple[Any, ...]:
     """Return the values of a repeated flag that `_gather_values` made one."""
     try:
         return tuple(kind(part) for kind, part in zip(_REPEATED[name], text.split(_JOINT), strict=True))
@@ -339,7 +348,7 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
     in_file = _read_toml(config, settings) if config else {}
     flags = {name: value for name, value in given.items() if value is not None and name in known}
     for name in _REPEATED.keys() & flags.keys():
-        flags[name] = tuple(_values_of(name, text) for text in flags[name])
+        flags[name] = tuple(split_values(name, text) for text in flags[name])
     flags |= {name: _word_or_number(flags[name]) for name in _WORDS_OR_NUMBERS & flags.keys()}
     try:
         return settings(**in_file | flags)

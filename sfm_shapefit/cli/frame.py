@@ -172,7 +172,10 @@ def command_run(
         if flags.images:  # now, not when all is computed
             refuse_no_folder(Path(flags.images))
         values = flat_values(options)
-        named = [flags.images, *(values.get(n, "") for n in ("fix", "without", "control_points", "gravity"))]
+        named = [
+            flags.images,
+            *(values.get(n, "") for n in ("fix", "without", "control_points", "scale_bars", "gravity")),
+        ]
         paths = [*inputs, config, *(Path(name) for name in named if name)]
         protect = [path for path in paths if path is not None]
         run = Run(options=options, flags=flags, protect=protect, started=started)

@@ -21,8 +21,8 @@ from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.command_options import LocateOptions
 
 _FLAGS = (
-    *("control_points", "known_distance", "fix", "without", "rotations", "intrinsics", "rigs", "adjust"),
-    *("scale", "min_trust", "points", "threads", "max_memory_mb"),
+    *("control_points", "scale_bars", "known_distance", "fix", "without", "rotations", "intrinsics"),
+    *("rigs", "adjust", "scale", "min_trust", "points", "threads", "max_memory_mb"),
 )
 """Options that are flags; the others are keys of --config."""
 

@@ -25,8 +25,18 @@ from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.files.matching_options import MatchingOptions
 
 _FLAGS = (
-    *("control_points", "known_distance", "gravity", "without", "intrinsics", "rigs", "adjust", "scale"),
-    *("join", "min_trust", "min_points_per_image", "min_model_size", "points", "threads", "max_memory_mb"),
+    *("control_points", "scale_bars", "known_distance", "gravity", "without", "intrinsics", "rigs"),
+    *(
+        "adjust",
+        "scale",
+        "join",
+        "min_trust",
+        "min_points_per_image",
+        "min_model_size",
+        "points",
+        "threads",
+        "max_memory_mb",
+    ),
 )
 """Options that are flags; the others are keys of --config."""
 

@@ -36,6 +36,7 @@ UNITS = {
     "prior": "of the priors' units",
     "fixed": "of the fixed cameras' units",
     "control points": "of the control points' units",
+    "scale bars": "of the scale bars' units",
 }
 """Unit of a standard deviation, by the choice of the scale."""
 SOLVER_UNITS = "of the solver's units"

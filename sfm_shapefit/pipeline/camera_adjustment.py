@@ -45,7 +45,7 @@ def pull_cameras(state: ModelState) -> ModelState:
     Priors without a standard deviation do not pull, nor do those whose axes are not known.
     """
     known = state.inputs.known
-    if known.priors is None or known.control is not None or state.frame.scale != "prior":
+    if known.priors is None or known.sets_scale or state.frame.scale != "prior":
         return state
     priors, options = known.priors.with_sigmas(), state.inputs.options.placement
     limited = state.source.memory_plan.limit(options)

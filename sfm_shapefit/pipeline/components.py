@@ -77,7 +77,7 @@ def start_run(
         matches = DatabaseMatches(file, images.names)
         images, intrinsics = choose_intrinsics(images, matches, options.freedom.intrinsics, inputs.left_out)
         gauge = between_images(options.gauge, images.names, "the database has no image")
-        known = read_known(images, file, priors, options.gauge.control_points, options.averaging.gravity)
+        known = read_known(images, file, priors, options.gauge, options.averaging.gravity)
     return MapContext(
         options=replace(options, gauge=gauge),
         clock=clock,

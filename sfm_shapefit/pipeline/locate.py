@@ -100,7 +100,7 @@ def locate(
             matches = stack.enter_context(closing(opened))
             wanted = options.freedom.intrinsics
             images, intrinsics = choose_intrinsics(given, matches, wanted, inputs.left_out, listed)
-            known = read_known(images, matches.file, priors, options.gauge.control_points)
+            known = read_known(images, matches.file, priors, options.gauge)
             fixed = read_fixed_images(model, options.fix)
             has_database = matches.file is not None
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)

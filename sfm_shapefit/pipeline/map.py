@@ -15,7 +15,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import MapResult, tell_joins
-from sfm_shapefit.facts.map_warnings import lost_distances, map_warnings
+from sfm_shapefit.facts.map_warnings import lost_bars, lost_distances, map_warnings
 from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
@@ -108,6 +108,7 @@ def map_opened(
             *map_warnings(run.read.rigs.incomplete, models),
             *join_warnings,
             *lost_distances(run.options.gauge.known_distance, models, joined),
+            *lost_bars(run.known.bars, models, joined),
         ),
     )
     return tell_joins(result)

@@ -182,11 +182,16 @@ def join_mapped(
     tied = tie_pieces(pieces, run.matches, run.without)
     joins = list(judge_joins(pieces, tied, priors))
     options, inputs = run.options, run.inputs
-    join_inputs = JoinInputs(joins, flat_values(options), inputs, options.gauge.known_distance, located)
+    join_inputs = JoinInputs(
+        joins, flat_values(options), inputs, options.gauge.known_distance, located=located
+    )
     joined = []
     for group in merge_groups(pieces, tied, joins):
-        source = see_matches(run.matches, read_model(group.reconstruction).images, inputs)
-        joined.append(tell_group(group, join_inputs, source, options.directions, run.clock.anew()))
+        images = read_model(group.reconstruction).images
+        rows = np.searchsorted(run.images.names, images.names)
+        told = join_inputs._replace(bars=run.known.bars and run.known.bars.of(rows))
+        source = see_matches(run.matches, images, inputs)
+        joined.append(tell_group(group, told, source, options.directions, run.clock.anew()))
     return tuple(joins), tuple(joined), tuple(warnings)
 
 

@@ -27,17 +27,18 @@ from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.reconstructions import name_of, transform_model
+from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.lengths import compare_bars, fit_bars
 from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.gauge_options import KnownDistance
-from sfm_shapefit.placement.gauge_rule import gauge_of_distances
+from sfm_shapefit.placement.gauge_rule import gauge_of_distances, resized_gauge
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
 from sfm_shapefit.placement.prior_join import PlacedByPriors, join_by_priors, place_by_priors
-from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.scene.given import PositionPriors, ScaleBars
 
 _SIGMA_OF = (
     "joined: what the models know of their cameras, and how well the joins are known; relative to the mean "
@@ -57,6 +58,8 @@ class JoinInputs(NamedTuple):
     inputs: Inputs
     """Where matches come from."""
     distances: Sequence[KnownDistance] = ()
+    bars: ScaleBars | None = None
+    """Scale bars with their marks in the images of the group."""
     located: Mapping[int, LocateResult] = MappingProxyType({})
     """The models by number, as far as they are ours, with what is known of their cameras."""
     notes: Sequence[str] = ()
@@ -209,7 +212,7 @@ def tell_group(
     folder = f"joined_{first}" if located else "."
     gauge = Gauge(scale="input", similarity=_SAME, statement="input: those of the first model")
     if first in located:
-        gauge, group = _choose_scale(group, located[first].gauge, join_inputs.distances)
+        gauge, group = _choose_scale(group, located[first].gauge, join_inputs)
     model = read_model(group.reconstruction)
     rows = {name: k for k, name in enumerate(model.images.names)}
     tied = np.array([(rows[a], rows[b]) for a, b in group.tied], dtype=np.int64).reshape(-1, 2)
@@ -217,6 +220,7 @@ def tell_group(
     checked = check_source(model, source, options, clock)
     seen, measures = checked.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
     cameras = joined_camera_rows(checked.cameras, group, located)
+    bars = join_inputs.bars and compare_bars(model.images, join_inputs.bars, None, gauge.scale_sigma)
     facts = JoinedFacts.taken_from(
         seen,
         inputs=join_inputs.inputs.facts,
@@ -231,9 +235,13 @@ def tell_group(
         scale=gauge.statement,
         scale_sigma=gauge.scale_sigma,
         known_distances=told_distances(join_inputs.distances, model.images),
+        scale_bars=bars.rows() if bars else (),
         datum=gauge.datum,
         timings_s=clock.seconds,
-        warnings=[*join_inputs.notes, *seen.warnings, *filter(None, [gauge.warning])],
+        warnings=[
+            *(*join_inputs.notes, *seen.warnings, *filter(None, [gauge.warning])),
+            *(bars.warnings() if bars else ()),
+        ],
     )
     return JoinedModel(
         reconstruction=group.reconstruction,
@@ -245,29 +253,36 @@ def tell_group(
     )
 
 
-def _choose_scale(
-    group: JoinedGroup, first: Gauge, known: Sequence[KnownDistance]
-) -> tuple[Gauge, JoinedGroup]:
+def _choose_scale(group: JoinedGroup, first: Gauge, join_inputs: JoinInputs) -> tuple[Gauge, JoinedGroup]:
     """Return the gauge of joined models, and the models in it.
 
-    A scale that the first model knows stays. An arbitrary scale gives way to known distances, within a model
-    or between two.
+    A scale that the first model knows stays. An arbitrary scale gives way to scale bars or known distances,
+    within a model or between two.
     """
-    number = next(iter(group.world_from))
-    placed = {name_of(image): image for image in group.reconstruction.images.values() if image.has_pose}
-    distances = [one for one in known if {*one[:2]} <= placed.keys()]
-    warning = ""
-    if first.scale in _ARBITRARY and distances:
-        centers = np.array([image.projection_center() for image in placed.values()])
+    images, warning = read_model(group.reconstruction).images, ""
+    distances = [one for one in join_inputs.distances if {*one[:2]} <= {*images.names}]
+    if first.scale in _ARBITRARY:
+        fit = join_inputs.bars and fit_bars(images, join_inputs.bars)
+        if join_inputs.bars and fit:
+            middle, said = (
+                images.centers.mean(axis=0),
+                f"scale bars: {join_inputs.bars.statement}; {fit.statement}",
+            )
+            motion, gauge = resized_gauge(first, middle, fit.scale, fit.sigma, said)
+            return gauge, _moved(group, motion)
         try:
-            gauge = gauge_of_distances(list(placed), centers, distances)
+            if distances:
+                gauge = gauge_of_distances(images.names, images.centers, distances)
+                return gauge, _moved(group, gauge.similarity)
         except InputError as error:  # two cameras stand in one place
             warning = str(error)
-        else:
-            world = group.world_from.items()
-            return gauge, group._replace(
-                reconstruction=transform_model(group.reconstruction, gauge.similarity),
-                world_from={number: compose(gauge.similarity, one) for number, one in world},
-            )
-    statement = f"that of model {number}: {first.statement}"
+    statement = f"that of model {next(iter(group.world_from))}: {first.statement}"
     return replace(first, statement=statement, warning=warning), group
+
+
+def _moved(group: JoinedGroup, motion: Similarity) -> JoinedGroup:
+    """Return joined models after a similarity of their world."""
+    return group._replace(
+        reconstruction=transform_model(group.reconstruction, motion),
+        world_from={number: compose(motion, one) for number, one in group.world_from.items()},
+    )

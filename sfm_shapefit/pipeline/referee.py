@@ -32,6 +32,7 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
+from sfm_shapefit.facts.scale_bars import MeasuredBars
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table, contradicting
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
@@ -94,6 +95,13 @@ class CheckResult(Reported, Stated):
         from sfm_shapefit.report.results import draw_checked
 
         return draw_checked(self.model, self.cameras, self.pairs, self.quality)
+
+    def with_bars(self, bars: MeasuredBars | None) -> "CheckResult":
+        """Return the same with scale bars that were compared with the model."""
+        if bars is None:
+            return self
+        warnings = [*self.facts.warnings, *bars.warnings()]
+        return replace(self, facts=replace(self.facts, scale_bars=bars.rows(), warnings=warnings))
 
     def _headline(self) -> str:
         return f"{self.facts.num_placed} of {self.facts.num_images} images, {self.verdict.statement}"

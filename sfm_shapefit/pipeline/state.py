@@ -14,6 +14,7 @@ from sfm_shapefit.base.executors import Advance, Crew
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
+from sfm_shapefit.facts.scale_bars import MeasuredBars
 from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -74,6 +75,8 @@ class ModelState:
     bundle: Estimate | None = None
     """How cameras and points were bundle adjusted, if that was asked for."""
     control: tuple[ControlPoint, ...] = ()
+    bars: MeasuredBars | None = None
+    """Scale bars as they are in the output."""
     evidence: ModelEvidence = _LATER
     warnings: tuple[str, ...] = ()
     """What the user should know, a sentence each, from the stages that know it."""
@@ -107,6 +110,11 @@ class ModelState:
     def among(self) -> IntArray | None:
         """The images whose matches are read: of a further piece, which is small, its own; None for all."""
         return self.placement.cameras if self.placement.piece else None
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """The last adjustment; None without one."""
+        return self.bundle or self.adjustment or self.first
 
     @property
     def freedom(self) -> Freedom:

@@ -24,6 +24,7 @@ from sfm_shapefit.scene.given import (
     FEWEST_CONTROL_POINTS,
     ControlPoints,
     MarkedViews,
+    Marks,
     PositionPriors,
     why_too_few,
 )
@@ -38,8 +39,8 @@ _MOST_ROUNDS = 20  # rounds, a bound; who fits settles in fewer
 _FLAT = 5.0  # standard deviations; a smaller spread across a line leaves the turn about the line open
 
 
-class TriangulatedControl(NamedTuple):
-    """Where a model has control points, and how well their marks agree."""
+class TriangulatedMarks(NamedTuple):
+    """Where a model has points that are marked in its images, and how well their marks agree."""
 
     positions: FloatArray
     """(k, 3), NaN for those that cannot be triangulated."""
@@ -65,10 +66,8 @@ class ControlFit(NamedTuple):
     """Relative standard deviation of the scale."""
 
 
-def triangulate_control_points(
-    control: ControlPoints, seen: MarkedViews, options: StructureOptions
-) -> TriangulatedControl:
-    """Return where the placed images have control points; marks may be wrong, or off by 4 keypoint errors."""
+def triangulate_marks(control: Marks, seen: MarkedViews, options: StructureOptions) -> TriangulatedMarks:
+    """Return where the placed images have points; marks may be wrong, or off by 4 keypoint errors."""
     counts = np.bincount(control.points[seen.rows], minlength=len(control.names))
     tracks = ObservedTracks(
         offsets=offsets_of(counts),
@@ -100,7 +99,7 @@ def triangulate_control_points(
     with np.errstate(invalid="ignore", divide="ignore"):
         off = np.linalg.norm(inside[:, :2] / inside[:, 2:] - seen.on_plane, axis=1)
         errors[seen.rows] = seen.focal_lengths_px * off
-    return TriangulatedControl(positions, errors, agreeing)
+    return TriangulatedMarks(positions, errors, agreeing)
 
 
 def fit_control_points(
