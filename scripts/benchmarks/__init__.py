@@ -15,6 +15,7 @@ INDEX = {
     "endtoend": "synth and locate at thousands of images: time by stage, memory and its forecast, exponents.",
     "graphs": "Families of graphs against the oracle: expanders, areas, communities, long chains, streets.",
     "join": "Models cut into pieces and joined by a few of the pairs between: right, refused, wrong.",
+    "lengths": "Scale bars between points of made scenes: how often the told intervals hold the truth.",
     "map": "From a database to an adjusted model: map beside pycolmap's global and incremental mapping.",
     "onedsfm": "The published 1DSfM scene Madrid Metropolis: seconds per stage, residuals of each objective.",
     "panoramas": "Native panoramas against a cubemap rig of one rendered yard, beside global mapping.",

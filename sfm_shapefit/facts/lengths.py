@@ -1,14 +1,13 @@
 """How well a length in a model is known, in the user's unit: for the whole model, and between two places."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.place_errors import Distances, PlaceErrors, ScaleErrors
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.display import Displayed, Row, row
+from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import rounded
 from sfm_shapefit.facts.scale_bars import ScaleBar
@@ -52,6 +51,13 @@ class LengthFacts(Record):
         worst = f"worst direction {along} (± {self.said(self.worst_half_width)})"
         within = f"± {self.said(self.half_width)} (95 %)"
         return f"a length of {self.length:g} {self.unit} here is known to {within}, {worst}"
+
+    @property
+    def relative(self) -> str:
+        """All of it in words, as shares of a length, for a model whose scale nothing known set."""
+        along = name_direction(np.array(self.worst_direction), has_up=self.has_up)
+        usual, worst = (100.0 * half / self.length for half in (self.half_width, self.worst_half_width))
+        return f"a length is known to ± {usual:.2g} % (95 %), worst direction {along} (± {worst:.2g} %)"
 
     @property
     def interval(self) -> str:
@@ -102,17 +108,6 @@ class LengthsFacts(Record):
             Row("scale bars", [one.line for one in self.scale_bars]),
             Row("warning", self.warnings),
         ]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class LengthEvaluation(Displayed):
-    """How well lengths of a model are known, and how scale bars compare."""
-
-    facts: LengthsFacts
-    """The figures, as they stand in JSON."""
-
-    def _headline(self) -> str:
-        return self.facts.usual.statement if self.facts.usual else "how well lengths are known is not known"
 
 
 def name_direction(direction: FloatArray, *, has_up: bool) -> str:

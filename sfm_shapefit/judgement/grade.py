@@ -61,6 +61,8 @@ from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
 
+OTHER_PLACE = "pairs agree on another place of it"
+"""Said of a camera of `ModelEvidence.places`, which tells more."""
 FEW_PLACED = 1.0 - CHANCE_SHARE  # share of images in the output; below, the model is to be looked at
 
 
@@ -108,7 +110,7 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     yield from of_each(
         Kind.SECOND_OPINION, second.undecided, f"{elsewhere}, and no pairs support either place"
     )
-    yield from of_each(Kind.PLACE, places, "pairs agree on another place of it")
+    yield from of_each(Kind.PLACE, places, OTHER_PLACE)
     if lenses:
         clause = f"images contradict {counted(len(lenses), 'focal length')}"
         yield of_model(Kind.LENS, clause, images=through)

@@ -11,7 +11,7 @@ from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import flat_values
-from sfm_shapefit.facts.joins import JoinOutcome
+from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.model import read_model
@@ -159,7 +159,7 @@ def _suspicions(averaging: AveragedRotations) -> Iterator[Reason]:
 
 def join_mapped(
     models: Sequence[LocateResult], run: MapContext
-) -> tuple[tuple[JoinOutcome, ...], tuple[JoinedModel, ...], tuple[str, ...]]:
+) -> tuple[tuple[JoinFacts, ...], tuple[JoinedModel, ...], tuple[str, ...]]:
     """Join the models of a run, largest first, where that is safe and wanted.
 
     Returns:

@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.scale_bars import fit_scale_bars
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
 from sfm_shapefit.facts.joined_cameras import JoinedGroup, joined_camera_rows, joined_verdict
-from sfm_shapefit.facts.joins import JoinOutcome
+from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.model import JoinedFacts
 from sfm_shapefit.facts.placed import UNITS, KeyFigures
@@ -30,7 +31,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.lengths import compare_bars, fit_bars
+from sfm_shapefit.pipeline.lengths import compare_bars
 from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.placement.gauge import Gauge
@@ -52,7 +53,7 @@ _SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
 class JoinInputs(NamedTuple):
     """What is known of joined models beside the models."""
 
-    joins: Sequence[JoinOutcome]
+    joins: Sequence[JoinFacts]
     """What came of joining each model to another."""
     options: Mapping[str, Any]
     inputs: Inputs
@@ -68,7 +69,7 @@ class JoinInputs(NamedTuple):
 
 def judge_joins(
     pieces: Sequence[ModelPiece], tied: TiedPieces, priors: Sequence[PositionPriors | None] = ()
-) -> Iterator[JoinOutcome]:
+) -> Iterator[JoinFacts]:
     """Yield what comes of joining each piece but the first: by pairs, or else by `priors` of its cameras."""
     outcomes = join_pieces(tied.cameras, tied.ties)
     usable = [] if tied.cameras.is_metric.any() else priors
@@ -79,16 +80,9 @@ def judge_joins(
             other = _join_by_priors(number, placed)
             done = other if isinstance(other, PieceJoin) or done == UNTIED else done
         join = _at_known_scale(pieces, done) if isinstance(done, PieceJoin) else None
-        to = 0 if join is None else join.to
         pairs = [] if join is None else tied.ties.matches.pairs[join.rivals].tolist()
-        yield JoinOutcome(
-            model=number,
-            to=to,
-            found=join,
-            reason=str(done) if join is None else join.reason,
-            labels=(pieces[number].label, pieces[to].label),
-            rivals=tuple((tied.names[v], tied.names[w]) for v, w in pairs),
-        )
+        rivals = [(tied.names[v], tied.names[w]) for v, w in pairs]
+        yield JoinFacts.of_models([piece.label for piece in pieces], number, join or str(done), rivals)
 
 
 def _at_known_scale(pieces: Sequence[ModelPiece], join: PieceJoin) -> PieceJoin:
@@ -129,16 +123,16 @@ def _join_by_priors(number: int, placed: Sequence[PlacedByPriors | str]) -> Piec
 
 
 def merge_groups(
-    pieces: Sequence[ModelPiece], tied: TiedPieces, joins: Sequence[JoinOutcome]
+    pieces: Sequence[ModelPiece], tied: TiedPieces, joins: Sequence[JoinFacts]
 ) -> list[JoinedGroup]:
     """Return the pieces that were joined, each group in the world of its first."""
     growing: dict[int, _Growing] = {}
     root = list(range(len(pieces)))
     for done in joins:
         if done.join is not None:
-            first = root[done.model] = root[done.to]
+            first = root[done.number] = root[done.to_number]
             group = growing[first] = growing.get(first) or _Growing(pieces[first], first)
-            group.add(done, pieces[done.model], tied)
+            group.add(done, pieces[done.number], tied)
     return [growing[number].group for number in sorted(growing)]
 
 
@@ -152,18 +146,18 @@ class _Growing:
         self.ids: dict[int, Mapping[int, int]] = {number: {i: i for i in reconstruction.point3D_ids()}}
         """New ids of each piece's points, by the old ones."""
 
-    def add(self, done: JoinOutcome, piece: ModelPiece, tied: TiedPieces) -> None:
+    def add(self, done: JoinFacts, piece: ModelPiece, tied: TiedPieces) -> None:
         """Take in a piece that was joined to one of the group."""
         assert done.join is not None
-        world_from = compose(self.group.world_from[done.to], done.join.to_from_piece)
-        worlds = {**self.group.world_from, done.model: world_from}
+        world_from = compose(self.group.world_from[done.to_number], done.join.to_from_piece)
+        worlds = {**self.group.world_from, done.number: world_from}
         same = self._same_points(done.join, worlds, tied)
         ours, theirs = self.group.reconstruction, piece.model.reconstruction
         merged, renamed, new = merge_models(ours, theirs, world_from, same)
         for number, ids in self.ids.items():
             self.ids[number] = {point: renamed.get(now, now) for point, now in ids.items()}
-        self.ids[done.model] = new
-        ends = [np.flatnonzero(tied.cameras.piece_of == k)[:2] for k in (done.model, done.to)]
+        self.ids[done.number] = new
+        ends = [np.flatnonzero(tied.cameras.piece_of == k)[:2] for k in (done.number, done.to_number)]
         names = dict.fromkeys(tied.names[v] for v in np.concatenate(ends).tolist())
         known = (*self.group.tied, *itertools.combinations(names, 2))
         self.group = JoinedGroup(merged, worlds, (*self.group.joins, done), known)
@@ -207,7 +201,7 @@ def tell_group(
     """Return joined models with what can be said of them; `source` has the matches of their images."""
     first, located = next(iter(group.world_from)), join_inputs.located
     labels = {
-        k: label for one in group.joins for k, label in zip((one.model, one.to), one.labels, strict=True)
+        k: name for one in group.joins for k, name in ((one.number, one.model), (one.to_number, one.to))
     }
     folder = f"joined_{first}" if located else "."
     gauge = Gauge(scale="input", similarity=_SAME, statement="input: those of the first model")
@@ -226,8 +220,11 @@ def tell_group(
         inputs=join_inputs.inputs.facts,
         options=dict(join_inputs.options),
         verdict=joined_verdict(seen.verdict, group, located),
-        models=[labels[number].removeprefix("model ") for number in group.world_from],
-        joins=[one.facts(folder if one.join and one.model in labels else None) for one in join_inputs.joins],
+        models=[labels[number] for number in group.world_from],
+        joins=[
+            replace(one, folder=folder if one.joined and one.number in labels else None)
+            for one in join_inputs.joins
+        ],
         num_images=len(cameras),
         num_placed=group.reconstruction.num_reg_images(),
         figures=KeyFigures.of_cameras(cameras, seen.figures.pair_error_deg, *measures),
@@ -262,11 +259,12 @@ def _choose_scale(group: JoinedGroup, first: Gauge, join_inputs: JoinInputs) -> 
     images, warning = read_model(group.reconstruction).images, ""
     distances = [one for one in join_inputs.distances if {*one[:2]} <= {*images.names}]
     if first.scale in _ARBITRARY:
-        fit = join_inputs.bars and fit_bars(images, join_inputs.bars)
-        if join_inputs.bars and fit:
+        known = join_inputs.bars
+        fit = known and fit_scale_bars(known, compare_bars(images, known, None, None).found)
+        if known and fit:
             middle, said = (
                 images.centers.mean(axis=0),
-                f"scale bars: {join_inputs.bars.statement}; {fit.statement}",
+                f"scale bars: {known.statement}; {fit.statement}",
             )
             motion, gauge = resized_gauge(first, middle, fit.scale, fit.sigma, said)
             return gauge, _moved(group, motion)

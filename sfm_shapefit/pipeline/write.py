@@ -9,6 +9,7 @@ import os
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -299,17 +300,19 @@ def _drawing_of(found: Any) -> "Drawing":
 
 def _write_report(found: Any, page: Path, images: Path | str, out: str = "OUT") -> bool:
     """Write a report, of several models that of the largest; False if pictures were asked for in vain."""
-    from sfm_shapefit.report.page import Folders, Pictures, write_report
+    from sfm_shapefit.report.page import Occasion, Pictures, write_report
     from sfm_shapefit.report.thumbnails import read_thumbnails
 
     shown = found.models[0] if isinstance(found, MapResult) else found
     drawing = _drawing_of(shown)
+    occasion = Occasion(out, day=date.today().isoformat())
     if not str(images):
-        write_report(drawing, shown.facts, page, folders=Folders(out))
+        write_report(drawing, shown.facts, page, occasion=occasion)
         return True
     small = read_thumbnails(Path(images), drawing.cameras.names, drawing.cameras.trust)
     pictures = Pictures(small, _matches_between(shown, drawing, small)) if small else None
-    write_report(drawing, shown.facts, page, pictures, Folders(out, str(images) if small else "IMAGES"))
+    occasion = occasion._replace(images=str(images)) if small else occasion
+    write_report(drawing, shown.facts, page, pictures, occasion)
     return bool(small)
 
 

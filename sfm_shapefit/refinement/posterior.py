@@ -56,7 +56,7 @@ _FIT_TRIANGLES = 100_000  # triangles that the histogram is fitted to; more chan
 _FIT_ROUNDS = 60  # rounds of expectation maximization; shares of neighboring levels part slowly
 _RANDOM_TRIANGLES = 50_000  # triangles that normalize the ratio; it is good to 10 % at the last level
 _SPACE = 3  # dimensions; random triangles are drawn in no more, see the header
-_LARGEST_LOG_RATIO = 300.0  # of a triangle; where all is exact, in many dimensions, no float holds it
+_LARGEST_LOG_RATIO = 300.0  # nats; no float holds the ratio of an exact triangle in many dimensions
 _PRIORS = (0.05, 0.95)  # least and largest share of right pairs; at 0 and 1 messages would be ignored
 
 
@@ -163,7 +163,8 @@ def _weighed_ratio(
     more = max(dimension - _SPACE, 0)
     spread = shapes.sines + 6.0 * tau**2
     exponent = shapes.off_plane**2 / (2.0 * tau**2 * spread) + shapes.gap**2 / (4.0 * tau**2)
-    peak = 0.5 * (xlogy(more, more) - more + xlogy(more, tau**2 * spread))  # of off_plane^more exp(-exponent)
+    # The largest value of off_plane^more exp(-exponent), so that a mean of these is a number.
+    peak = 0.5 * (xlogy(more, more) - more + xlogy(more, tau**2 * spread))
     logs = np.minimum(log_weights - exponent - peak, _LARGEST_LOG_RATIO)
     return np.asarray(spread ** (0.5 * (2 - min(dimension, _SPACE))) * np.exp(logs))
 

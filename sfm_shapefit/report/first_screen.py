@@ -50,6 +50,7 @@ def tiles(drawing: Drawing, facts: Facts) -> list[dict[str, str]]:
     return [
         _placed_tile(drawing),
         *_uncertainty_tile(facts),
+        *_length_tile(facts),
         *_points_tile(drawing, facts),
         _doubtful_tile(drawing, facts),
         *_error_tile(facts),
@@ -141,6 +142,14 @@ def _uncertainty_tile(facts: Facts) -> Iterator[dict[str, str]]:
         label = f"typical uncertainty, {100.0 * share:.2g}% of the scene{scope_of(of)}"
         hint = f"Median standard deviation of a position: {sigma:.2g} {figures.sigma_unit} ({of})."
         yield _tile(f"± {sigma:.2g} units", label, hint)
+
+
+def _length_tile(facts: Facts) -> Iterator[dict[str, str]]:
+    lengths = facts.lengths if isinstance(facts, ModelFacts) else None
+    if lengths is not None and lengths.has_scale:
+        label = f"on a length of {lengths.length:g} {lengths.unit} (95 %)"
+        statement = lengths.statement
+        yield _tile(f"± {lengths.said(lengths.half_width)}", label, f"{statement[0].upper()}{statement[1:]}.")
 
 
 def _doubtful_tile(drawing: Drawing, facts: Facts) -> dict[str, str]:

@@ -61,16 +61,18 @@ class Pictures(NamedTuple):
     """Matches between them; None where there are none at hand."""
 
 
-class Folders(NamedTuple):
-    """What the next command calls the folders, as the user typed them."""
+class Occasion(NamedTuple):
+    """When and where a page is written."""
 
     out: str = "OUT"
-    """That of the model."""
+    """What the next command calls the folder of the model, as the user typed it."""
     images: str = "IMAGES"
+    """The same of the images."""
+    day: str = ""
 
 
-UNKNOWN = Folders()
-"""In place of folders that nobody knows."""
+UNKNOWN = Occasion()
+"""Where a page is written that nobody keeps."""
 
 
 def write_report(
@@ -78,17 +80,17 @@ def write_report(
     facts: Facts,
     path: Path,
     pictures: Pictures | None = None,
-    folders: Folders = UNKNOWN,
+    occasion: Occasion = UNKNOWN,
 ) -> None:
     """Write the report of a result; see `report_html`."""
-    path.write_text(report_html(drawing, facts, pictures, folders), encoding="utf-8", newline="\n")
+    path.write_text(report_html(drawing, facts, pictures, occasion), encoding="utf-8", newline="\n")
 
 
 def report_html(
-    drawing: Drawing, facts: Facts, pictures: Pictures | None = None, folders: Folders = UNKNOWN
+    drawing: Drawing, facts: Facts, pictures: Pictures | None = None, occasion: Occasion = UNKNOWN
 ) -> str:
     """Return the page, with pictures if there are some."""
-    data, script = page_data(drawing, facts, pictures, folders), _script()
+    data, script = page_data(drawing, facts, pictures, occasion), _script()
     values = {
         "title": html.escape(f"{data['title']} \N{EN DASH} sfm_shapefit"),
         "hashes": f"'sha256-{_hash(script)}'",
@@ -101,7 +103,7 @@ def report_html(
 
 
 def page_data(
-    drawing: Drawing, facts: Facts, pictures: Pictures | None = None, folders: Folders = UNKNOWN
+    drawing: Drawing, facts: Facts, pictures: Pictures | None = None, occasion: Occasion = UNKNOWN
 ) -> dict[str, Any]:
     """Return everything that the page shows, as JSON values; cameras and pairs stand worst first."""
     trust = drawing.cameras.trust
@@ -118,7 +120,11 @@ def page_data(
     return {
         "title": scene_name(facts),
         "subtitle": _subtitle(facts),
-        "banner": {name: shorten(text, 1000) for name, text in banner(drawing, facts, *folders).items()},
+        "day": occasion.day,
+        "banner": {
+            name: shorten(text, 1000)
+            for name, text in banner(drawing, facts, occasion.out, occasion.images).items()
+        },
         "tiles": tiles(drawing, facts),
         "summary": summary_sentences(drawing, facts),
         "expertFacts": [shorten(text, 4 * MAX_TEXT) for text in facts.expert_sentences()],
@@ -152,6 +158,7 @@ def page_data(
         "lenses": [[shorten(cell) for cell in lens] for lens in drawing.lenses[:_MAX_ROWS]],
         "intrinsics": _cells(facts, "intrinsics", lambda lens: -abs(lens.change)),
         "control": _cells(facts, "control_points", lambda point: -(point.error or 0.0)),
+        "bars": _cells(facts, "scale_bars", lambda bar: -abs(bar.error_sigmas or 0.0)),
         "loops": _cells(facts, "loops", lambda loop: (-loop.num_refused, -loop.num_matches)),
         "pieces": [_piece(k, piece) for k, piece in enumerate(facts.pieces)],
         "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts.timings_s.items()],

@@ -13,8 +13,9 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.wording import make_printable
-from sfm_shapefit.facts.model import FactsOfModel
+from sfm_shapefit.facts.model import FactsOfModel, ModelFacts
 from sfm_shapefit.facts.placed import Facts
+from sfm_shapefit.judgement.grade import OTHER_PLACE
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.report.drawing import Drawing, PairClass
@@ -23,7 +24,7 @@ MAX_TEXT = 160  # characters of a name or sentence that are shown; strangers may
 _OF_PAIRS = "of the pairs contradict"  # as a warning says that counts them
 _SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 _FEW_PAIRS = 4  # contradicting pairs; that most are of one camera says nothing where there are fewer
-_HAVE_TABLES = {"intrinsics", "control points", "numbered images"}
+_HAVE_TABLES = {"intrinsics", "control points", "scale bars", "numbered images"}
 _SHOWN = 3  # items of a kind among the first things to look at; the tables have all
 _MOST_WEAK = 6  # weak cameras among these; the table of cameras has all
 
@@ -54,6 +55,7 @@ def summary_sentences(drawing: Drawing, facts: Facts) -> list[str]:
     return [
         _pairs(drawing),
         *_certainty(drawing, facts),
+        *_relative_lengths(facts),
         f"Units and axes: {shorten(units or stated, 2 * MAX_TEXT)}.",
         *(
             f"{label[:1].upper()}{label[1:]}: {shorten('; '.join(lines), 4 * MAX_TEXT)}."
@@ -138,6 +140,13 @@ def _certainty(drawing: Drawing, facts: Facts) -> Iterator[str]:
     yield f"The least certain position is that of {who}: ± {sigma:.2g} units.{shorten(meaning)}"
 
 
+def _relative_lengths(facts: Facts) -> Iterator[str]:
+    """Yield how well lengths are known where nothing known set the scale; else `scene_rows` says it."""
+    lengths = facts.lengths if isinstance(facts, ModelFacts) else None
+    if lengths is not None and not lengths.has_scale:
+        yield f"Relative to the size of the scene, {lengths.relative}."
+
+
 def _warnings(drawing: Drawing, facts: Facts, told: set[int | None]) -> Iterator[Hint]:
     """Yield warnings, but for those of a camera of which something is told anyway.
 
@@ -183,7 +192,9 @@ def _weak(drawing: Drawing, facts: Facts) -> Iterator[Hint]:
         if cameras.reasons[k] and cameras.names[k] in facts.verdict.cameras
     ]
     for row in rows[:_MOST_WEAK]:
-        yield Hint(text=f"{shorten(cameras.names[row])}: {shorten(cameras.reasons[row])}", camera=row)
+        clauses = [one for one in cameras.reasons[row].split("; ") if one != OTHER_PLACE]  # which is told
+        if clauses:
+            yield Hint(text=f"{shorten(cameras.names[row])}: {shorten('; '.join(clauses))}", camera=row)
     if len(rows) > _MOST_WEAK:
         yield Hint(text=f"{len(rows) - _MOST_WEAK:,} more are weak; the table of cameras says why")
 

@@ -12,7 +12,9 @@ import pytest
 from sfm_shapefit.adjustment.estimate import BundleAdjustment
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics
+from sfm_shapefit.facts.lengths import LengthFacts
 from sfm_shapefit.facts.placed import IN_MEMORY, KeyFigures
+from sfm_shapefit.facts.scale_bars import ScaleBar
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
@@ -434,6 +436,59 @@ def test_the_title_is_the_name_of_the_scene(inputs, title, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path / "yard")
     facts = make_drawing()[1]
     assert scene_name(replace(facts, inputs=replace(facts.inputs, **inputs))) == title
+
+
+LENGTHS = LengthFacts(
+    length=10.0,
+    half_width=0.004,
+    worst_direction=[0.0, 0.1, 0.99],
+    worst_half_width=0.006,
+    unit="m",
+    has_up=True,
+    has_scale=True,
+)
+
+
+def test_a_length_is_told_in_the_users_unit_or_relative_and_never_where_nothing_is_known():
+    drawing, facts = make_drawing()
+    said = "length of 10 m here is known to ± 4 mm (95 %), worst direction up (± 6 mm)"
+
+    def told(lengths):
+        known = replace(facts, lengths=lengths)
+        values = [tile["value"] for tile in tiles(drawing, known) if tile["label"].startswith("on a length")]
+        return " ".join(summary_sentences(drawing, known)), values
+
+    text, values = told(LENGTHS)
+    assert said in text
+    assert values == ["± 4 mm"]
+    text, values = told(replace(LENGTHS, has_scale=False))
+    assert "the scene, a length is known to ± 0.04 % (95 %), worst direction up (± 0.06 %)." in text
+    assert said not in text
+    assert values == []
+    text, values = told(None)
+    assert "length" not in text
+    assert values == []
+
+
+def test_scale_bars_have_a_table_the_worst_first():
+    drawing, facts = make_drawing()
+    bar = ScaleBar(
+        name="long",
+        use="control",
+        known=2.0,
+        known_sigma=0.001,
+        found=2.001,
+        found_sigma=0.001,
+        error=0.001,
+        error_sigmas=0.7,
+        error_px=0.5,
+        num_marks=6,
+        num_agreeing_marks=5,
+    )
+    worse = replace(bar, name="short", use="check", error_sigmas=-3.0)
+    bars = page_data(drawing, replace(facts, scale_bars=(bar, worse)))["bars"]
+    assert [cells[0] for cells in bars] == ["short", "long"]
+    assert bars[1] == bar.cells
 
 
 def test_nothing_known_nothing_claimed():

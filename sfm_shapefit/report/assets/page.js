@@ -3,7 +3,7 @@
 const drawHead = () => {
   const { banner } = data;
   $("title").textContent = data.title;
-  $("subtitle").textContent = data.subtitle;
+  $("subtitle").textContent = [data.subtitle, data.day].filter(Boolean).join(", ");
   $("banner").dataset.grade = banner.grade;
   $("h-cameras").textContent = `${capital(data.noun)}s`;
   $("h-matrix").textContent = `Which ${data.noun}s are paired`;
@@ -95,6 +95,8 @@ const drawControl = () => {
   $("control-card").hidden = !data.control.length;
   fill("control", plainTable(["Name", "Use", "Off by (units)", "Along the axes (units)", "Off by (px)", "Marks"], data.control));
   $("control-note").textContent = data.notes.control;
+  $("bars-card").hidden = !data.bars.length;
+  fill("bars", plainTable(["Name", "Use", "Known (units)", "In the model (units)", "Off by (units)", "(σ)", "Off by (px)", "Marks"], data.bars));
 };
 const drawLoops = () => {
   $("loops-card").hidden = !data.loops.length;

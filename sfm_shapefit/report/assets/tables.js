@@ -3,6 +3,7 @@
 const ROWS_PER_PAGE = 10;
 
 const makeTable = (id, kind, total, columns, text, why, onChoice) => {
+  const isRanked = kind === "pair" || isKnown(cameras.trust) || cameras.reason.some((code) => code > 0);
   let order = Array.from({ length: total }, (_, k) => k);
   let page = 0;
   let sorted = null;
@@ -58,7 +59,7 @@ const makeTable = (id, kind, total, columns, text, why, onChoice) => {
     const last = Math.min(first + ROWS_PER_PAGE, order.length);
     body.replaceChildren(...order.slice(first, last).flatMap(rowOf));
     shown.textContent = order.length ? `${count(first + 1)}–${count(last)} of ${count(order.length)}` : "none";
-    if (order.length && !sorted) shown.append(element("span", ", worst first", "minor"));
+    if (order.length && !sorted && isRanked) shown.append(element("span", ", worst first", "minor"));
     back.disabled = page === 0;
     next.disabled = last >= order.length;
   };
