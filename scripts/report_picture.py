@@ -26,11 +26,6 @@ WORDS = """
     return shown.map((id) => document.getElementById(id).innerText).join('\\n');
 """
 
-# Folders of this machine are named from where it was started.
-SHORTEN = (
-    "const told = document.getElementById('command'); told.textContent = told.textContent.replaceAll(%r, '')"
-)
-
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
@@ -42,7 +37,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         page = args.out / "report.html"
         page = page if page.exists() else args.out / "0/report.html"  # of `map`
         opened(driver, page.resolve())
-        driver.execute_script(SHORTEN % f"{Path.cwd()}/")
         if args.camera:
             driver.execute_script(CLICK % args.camera)
             driver.execute_async_script("setTimeout(arguments[0], 3000)")  # it flies there

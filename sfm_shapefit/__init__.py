@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.facts.result import LocateResult as LocateResult
     from sfm_shapefit.files.colmap.quiet import hear_pycolmap as hear_pycolmap
     from sfm_shapefit.files.matching_options import MatchingOptions as MatchingOptions
+    from sfm_shapefit.files.undistortion_options import UndistortionOptions as UndistortionOptions
     from sfm_shapefit.graph.viewgraph import ViewGraph as ViewGraph
     from sfm_shapefit.judgement.trust_options import TrustOptions as TrustOptions
     from sfm_shapefit.pairs.direction_options import DirectionOptions as DirectionOptions
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.evaluate import evaluate as evaluate
     from sfm_shapefit.pipeline.inspect import inspect as inspect
     from sfm_shapefit.pipeline.join import join as join
+    from sfm_shapefit.pipeline.lengths import evaluate_lengths as evaluate_lengths
     from sfm_shapefit.pipeline.locate import locate as locate
     from sfm_shapefit.pipeline.map import map_database as map_database
     from sfm_shapefit.pipeline.match import match_images as match_images
@@ -82,6 +84,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "files.colmap.quiet": ("hear_pycolmap",),
     "files.matching_options": ("MatchingOptions",),
+    "files.undistortion_options": ("UndistortionOptions",),
     "adjustment.adjustment_options": ("AdjustmentOptions",),
     "pipeline.bundle_adjust": ("AdjustedModel", "bundle_adjust"),
     "pipeline.check": ("check", "check_pieces"),
@@ -91,6 +94,7 @@ _HOMES = {
     "pipeline.evaluate": ("evaluate",),
     "pipeline.inspect": ("inspect",),
     "pipeline.join": ("join",),
+    "pipeline.lengths": ("evaluate_lengths",),
     "pipeline.locate": ("locate",),
     "pipeline.map": ("map_database",),
     "pipeline.match": ("match_images",),

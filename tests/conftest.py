@@ -18,6 +18,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.clusters import client_of
 from tests.scenes import COURTYARD, RING
 
 pytest_plugins = ["pytester", "sfm_shapefit.synthetic.fixtures"]
@@ -41,6 +42,13 @@ def drawn(tmp_path_factory) -> tuple[RenderedScene, Path]:
     folder = tmp_path_factory.mktemp("drawn") / "workspace"
     write_rendered_workspace(scene, folder, WorkspaceOptions(relative_poses=True))
     return scene, folder
+
+
+@pytest.fixture(scope="session")
+def dask_client():
+    """A client of two workers, threads of this process."""
+    with client_of(2) as client:
+        yield client
 
 
 @pytest.fixture(scope="session")

@@ -195,6 +195,8 @@ def _facts(names):
         rigid_groups=None,
         intrinsics=(),
         refined_rigs=(),
+        scale_bars=(),
+        lengths=None,
         line_sigma=None,
         num_doubtful_pairs=0,
         loops=(),

@@ -75,7 +75,6 @@ _BOTH = {
     "without-pairs": "--without scenes/{scene}/pairs.txt",
     "unit": "--scale unit",
     "one-thread": "--threads 1",
-    "processes": "--executor processes --threads 2",
     "little-memory": "--max-memory-mb 1",
     "strict": "--strict",
 }
@@ -143,7 +142,7 @@ _MAP = {
 }
 _MAPPED = {
     "photographed": "adjusted all-trusted many-matches large-models unadjusted points-never shapefit priors "
-    "priors-pull control gravity processes few-points-kept one-thread",
+    "priors-pull control gravity few-points-kept one-thread",
     "photographed-guessed": "adjusted lenses-held lenses-all unadjusted",
     "courtyard": "adjusted gravity priors-pull control distances points-never without-pairs unadjusted",
     "ring8": "gravity distance priors points-never",

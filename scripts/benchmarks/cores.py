@@ -169,7 +169,7 @@ def measure_set(name: str, folder: Path, args: argparse.Namespace) -> list[Row]:
             break  # fewer cores take no longer than this
     most = max(ours)
     with on_cores(most):
-        stages = call(look_at_stages, command, given, most, environment=thread_environment(most))
+        stages = call(look_at_stages, command, given, most, environment=thread_environment(1))
     return [*rows_of(name, OURS, ours, peers), *rows_of(name, PEER, peers), *rows_of_stages(name, stages)]
 
 
@@ -186,7 +186,7 @@ def run_ours(command: str, given: Path, count: int) -> Spent:
         with on_cores(count):
             process = subprocess.Popen(
                 [sys.executable, "-m", "sfm_shapefit", *map(str, words)],
-                env=os.environ | thread_environment(count),
+                env=os.environ | thread_environment(1),  # as the command line has it; threads of BLAS idle
                 cwd=ROOT,
             )
         watch = Watch(process.pid)

@@ -100,7 +100,7 @@ def adjust_placement(run: AdjustmentRun) -> Estimate:
     if pull_rad is None:
         # The loss of the adjustment itself: a wider one lets wrong matches hide what the right ones say.
         loss_scale_px = run.choose_scale(problem) * run.options.max_reprojection_error_px
-        loss = AdjustmentOptions(loss_scale_px=loss_scale_px, threads=run.threads)
+        loss = AdjustmentOptions(loss_scale_px=loss_scale_px, threads=run.crew.threads)
         errors = estimate_rotation_errors(problem, loss)
         if isinstance(links, ObservedTracks):
             errors = without_unseen_turns(errors, problem, loss, run.share_of_frames(tracks, found))

@@ -173,8 +173,8 @@ class GroundedSystem:
         return nodes
 
     def by_frame(self, blocks: FloatArray) -> FloatArray:
-        """Put blocks of the nodes (N, 3, 3) in the places of their frames: 0 if fixed, NaN if unseen."""
-        found = np.zeros((len(self.unseen), 3, 3))
+        """Put blocks of the nodes (N, ...) in the places of their frames: 0 if fixed, NaN if unseen."""
+        found = np.zeros((len(self.unseen), *blocks.shape[1:]))
         moves = self.layout.node_of_frame >= 0
         found[moves] = blocks[self.layout.node_of_frame[moves]]
         found[self.unseen] = np.nan
@@ -281,7 +281,7 @@ def _dual(motions: FloatArray, nodes: IntArray) -> FloatArray:
             gram = np.einsum("nai,naj->ij", dual, motions)
         read: FloatArray = dual @ np.linalg.inv(gram)
     except np.linalg.LinAlgError:
-        raise UnsolvableError("its cameras do not stand apart where the adjustment has them") from None
+        raise UnsolvableError("its cameras are not apart where the adjustment has them") from None
     return read
 
 

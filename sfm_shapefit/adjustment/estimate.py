@@ -44,6 +44,11 @@ class Estimate:
     covariances: FloatArray | None = None
     """Covariances (i, 3, 3) of the centers, an image of a rig having its frame's, in squared units of the
     images; see `shared_errors`. None where unknown, as for more frames than are worth the time."""
+    draws: FloatArray | None = None
+    """Errors of the frames (f, 6, s) of which the covariances are, but for what lenses add that move or are
+    left open; see `CenterErrors`. None where the covariances are."""
+    noise_px: float = math.nan
+    """Standard deviation of an observation along an axis; NaN where it is unknown."""
     lens_errors: LensErrors | None = None
     """What the covariances take errors of the lenses for; None where they are unknown."""
     scale_sigma: float | None = None

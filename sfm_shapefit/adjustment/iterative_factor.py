@@ -31,17 +31,15 @@ import numpy as np
 from sfm_shapefit.adjustment.gauge import small_similarities
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.schur import ReducedSystem
-from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct, rank_within, rows_of_parts, sum_by
+from sfm_shapefit.adjustment.schur import UNDETERMINED, ReducedSystem
+from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct, rank_within, sum_by
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.laplacian.blocks import cut_graph, grow_blocks
 from sfm_shapefit.laplacian.factor import Factor, allocate_factor, analyze
 from sfm_shapefit.laplacian.operators import Workers
-
-UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"
-"""What is said of a system that is singular."""
 
 # Nodes of a block, and the share of them by which it grows; the counts of iterations hardly depend on them.
 _BLOCK, _OVERLAP = 150, 0.15
@@ -140,12 +138,12 @@ class _Block:
 
     def __init__(self, nodes: IntArray, layout: Layout, size: int) -> None:
         """Take ascending nodes, of so many slots each."""
-        first, rows = rows_of_parts(layout.first_pair, nodes)
-        seconds = layout.pairs[rows, 1]
+        pairs_of = RowLists(layout.first_pair, np.arange(len(layout.pairs))).subset(nodes)
+        seconds = layout.pairs[pairs_of.rows, 1]
         places = np.searchsorted(nodes, seconds).clip(max=len(nodes) - 1)
         inside = nodes[places] == seconds
-        edges = np.stack([np.repeat(np.arange(len(nodes)), np.diff(first)), places], axis=1)[inside]
-        self.nodes, self.rows, self.size = nodes, rows[inside], size
+        edges = np.stack([pairs_of.list_of_rows(), places], axis=1)[inside]
+        self.nodes, self.rows, self.size = nodes, pairs_of.rows[inside], size
         self.part = _Part.of_block(len(nodes), edges, size)
         self.solution = np.zeros((0, size))
 

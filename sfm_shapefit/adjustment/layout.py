@@ -15,7 +15,7 @@ moves in the plane across it, `sensor_bases` has no third column, and the slot i
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -115,11 +115,29 @@ class Layout:
         return int(self.active.sum())
 
 
-def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
-    """Return the structure of an adjustment."""
-    frame_of_camera, sensor_of_camera = problem.rig.frame_of_camera, problem.rig.free_sensor_of_camera
+class Nodes(NamedTuple):
+    """What is unknown of an adjustment, in nodes; fields as of `Layout`."""
+
+    node_of_frame: IntArray
+    node_of_lens: IntArray
+    node_of_sensor: IntArray
+    active: BoolArray
+    lens_slots: IntArray
+    sensor_bases: FloatArray
+    scale_sensor: int
+
+
+def number_nodes(problem: AdjustmentProblem, options: AdjustmentOptions) -> Nodes:
+    """Return the nodes of an adjustment: frames, then lenses, then sensors."""
     scale_sensor = find_scale_sensor(problem)
-    node_of_frame, node_of_lens, node_of_sensor, active, lens_slots = _nodes(problem, options, scale_sensor)
+    return Nodes(*_nodes(problem, options, scale_sensor), _sensor_bases(problem, scale_sensor), scale_sensor)
+
+
+def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions, nodes: Nodes | None = None) -> Layout:
+    """Return the structure of an adjustment; of a part of one, whose nodes are those of the whole."""
+    frame_of_camera, sensor_of_camera = problem.rig.frame_of_camera, problem.rig.free_sensor_of_camera
+    numbers = number_nodes(problem, options) if nodes is None else nodes
+    node_of_frame, node_of_lens, node_of_sensor, active = numbers[:4]
     point, camera, pixels = problem.points_seen, problem.cameras_seeing, problem.pixels
     order = np.arange(len(point))
     if (point[1:] < point[:-1]).any():  # else the arrays are shared, since all of them are large
@@ -129,10 +147,10 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
     frame_node = node_of_frame[frame_of_camera]
     lens_node = node_of_lens[problem.lens_of_camera]
     sensor_node = np.append(node_of_sensor, -1)[sensor_of_camera]
-    nodes = np.stack([frame_node, lens_node, sensor_node])
+    seeing = np.stack([frame_node, lens_node, sensor_node])
     workers = Workers(options.threads)
     where = np.full((3, len(camera)), -1)  # as it stays where there is no entry
-    enter = partial(_enter, first_observation, camera, nodes, where)
+    enter = partial(_enter, first_observation, camera, seeing, where)
     first_entry, entry_node = _list(enter, first_observation, workers)
     entry_point = np.repeat(np.arange(problem.num_points), np.diff(first_entry))
     first_of_node, by_node = group_by(frozen(entry_node), len(active))
@@ -140,16 +158,10 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
     first_pair, seconds = _list(meet, first_of_node, workers)
     workers.close()
     pairs = np.stack([np.repeat(np.arange(len(active)), np.diff(first_pair)), seconds], axis=1)
-    links, links_of_camera = _links(nodes, camera)
+    links, links_of_camera = _links(seeing, camera)
     pair_keys = pairs[:, 0] * len(active) + pairs[:, 1]
     return Layout(
-        node_of_frame=node_of_frame,
-        node_of_lens=node_of_lens,
-        node_of_sensor=node_of_sensor,
-        sensor_bases=_sensor_bases(problem, scale_sensor),
-        scale_sensor=scale_sensor,
-        active=active,
-        lens_slots=lens_slots,
+        **numbers._asdict(),
         held_of_lens=held_of(problem.lenses),
         observation=order,
         first_observation=first_observation,

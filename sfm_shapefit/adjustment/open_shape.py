@@ -25,6 +25,7 @@ from sfm_shapefit.adjustment.lens_doubts import excess
 from sfm_shapefit.adjustment.run import FINE_TIMES, MOST_FRAMES, begin
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.executors import Crew
 from sfm_shapefit.base.geometry import INSIDE, distances_in_spreads, fit_similarity_l1
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import PARTS, Lens, Origin
@@ -62,7 +63,7 @@ def estimate_open_shape(
     if len(images.frames.ids) > MOST_FRAMES:
         return None
     try:
-        run = begin(images, tracks, StructureOptions(), freedom, threads=threads)
+        run = begin(images, tracks, StructureOptions(), freedom, crew=Crew(threads))
         tracks, found, problem = run.problem_of_all(checked=True)
         run = replace(run, freedom=replace(run.freedom, noise_px=noise_px_of(problem)))
         few = run.thin_problem(tracks, found, times=FINE_TIMES)

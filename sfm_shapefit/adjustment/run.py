@@ -49,6 +49,7 @@ from sfm_shapefit.adjustment.sources import Links, with_rays_of
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.executors import HERE, Crew
 from sfm_shapefit.base.threads import count_threads
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import FOCAL
@@ -85,6 +86,7 @@ _FINE = 0.9
 # Solves repeated with lenses held that were left open; each takes as long as the first.
 _MOST_REPETITIONS = 2
 _FEW = 0.1  # share of the images; the lenses of the others do not depend on so few
+MOST_WHOLE = 20_000  # frames; the observations of more are divided, as one machine may not have the memory
 MOST_FRAMES = 2_000  # frames; the standard deviations of more would take longer than all the rest
 
 
@@ -100,8 +102,8 @@ class AdjustmentRun:
     freedom: Freedom
     """Lenses that the observations leave open are held from then on."""
     given: GivenPoses
-    threads: int
-    """Threads of each solve, see `AdjustmentOptions`."""
+    crew: Crew
+    """Who works; many frames are divided among them."""
     checked_length: int
     """Fewest observations of a point that a model may have."""
     focal_sigmas: FloatArray
@@ -139,7 +141,7 @@ class AdjustmentRun:
             min_angle_deg=self.options.min_triangulation_angle_deg,
             min_length=self.checked_length if checked else self.options.min_track_length,
         )
-        poses, threads = views_of(self.images).poses(self.images), count_threads(self.threads)
+        poses, threads = views_of(self.images).poses(self.images), count_threads(self.crew.threads)
         assert self.links is not None
         if isinstance(self.links, ObservedTracks):
             joined, found = self.links, triangulate_tracks(self.links, poses, limits, threads)
@@ -178,9 +180,12 @@ class AdjustmentRun:
         thin = tracks.of_points(found.points_seen)
         images = views_of(self.images).images[thin.cameras]
         chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, self.images.num_images, times)
-        seen = np.repeat(np.arange(len(chosen)), thin.lengths()[chosen])
-        points = TriangulatedPoints(points=found.points[chosen], tracks=chosen, points_seen=seen)
-        return self.problem(thin.subset(chosen), points)
+        del images
+        place = np.full(len(found.points), -1)
+        place[chosen] = np.arange(len(chosen))
+        points = found.points[chosen]
+        seen = thin.spread(place)  # rather than a copy of the tracks that are chosen, which is large
+        return self.problem(thin, TriangulatedPoints(points=points, tracks=chosen, points_seen=seen))
 
     def choose_scale(self, problem: AdjustmentProblem) -> float:
         """Return the scale of the loss that the errors of a problem call for, in pixel thresholds."""
@@ -204,10 +209,12 @@ class AdjustmentRun:
             first_damping, settles_points: see `AdjustmentOptions`.
         """
         scale = self.choose_scale(problem) if scale is None else scale
+        is_divided = self.crew.divides or problem.num_frames > MOST_WHOLE
         run = replace(self, loss_scale_px=scale * self.options.max_reprojection_error_px)
         done = adjust(
             self.freedom.apply(problem, self.given.rotations),
             run.options_at_optimum(),
+            crew=self.crew if is_divided else None,
             cost_tolerance=fall,
             first_damping=first_damping,
             settles_points=settles_points,
@@ -222,7 +229,7 @@ class AdjustmentRun:
             loss_scale_px=self.loss_scale_px,
             hold_rotations=self.freedom.holds_rotations,
             noise_px=self.freedom.noise_px,
-            threads=self.threads,
+            threads=self.crew.threads,
         )
 
     def moved(self, images: Images) -> "AdjustmentRun":
@@ -294,6 +301,8 @@ class AdjustmentRun:
             freedom=self.freedom,
             errors=errors,
             covariances=covariances,
+            draws=None if known is None else known.draws,
+            noise_px=math.nan if known is None else known.noise_px,
             lens_errors=None if known is None else known.lens_errors,
             scale_sigma=None if known is None else known.scale_sigma,
             focal_sigmas=run.focal_sigmas,
@@ -352,7 +361,7 @@ def begin(
     options: StructureOptions,
     freedom: Freedom,
     given: GivenPoses | None = None,
-    threads: int = 0,
+    crew: Crew = HERE,
 ) -> AdjustmentRun:
     """Return the run of an adjustment that is to begin.
 
@@ -362,7 +371,7 @@ def begin(
         options: filters of points.
         freedom: what moves.
         given: what is known of their poses; nothing if None.
-        threads: see `AdjustmentOptions`.
+        crew: who works.
     """
     given = given or GivenPoses()
     fewest = options.fewest_views(images.num_images) if isinstance(links, MatchedKeypoints) else 2
@@ -373,7 +382,7 @@ def begin(
         options=options,
         freedom=freedom.over(num_lenses),
         given=given if given.rotations is not None else given._replace(rotations=images.frames.rotations),
-        threads=threads,
+        crew=crew,
         checked_length=max(options.min_track_length, fewest),
         focal_sigmas=np.full(num_lenses, np.nan),
         undetermined=np.zeros(num_lenses, dtype=np.bool_),

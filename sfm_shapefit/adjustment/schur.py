@@ -24,6 +24,9 @@ _ENTRIES_WORTH_A_THREAD = 1_000  # entries; each meets all others of its point, 
 _ENTRIES_OF_POINTS_WORTH_A_THREAD = 50_000  # entries; each is only multiplied by a step
 _SINGULAR = 1e-12  # least pivot of a point's block, relative to its diagonal: a parallax of 1e-6 rad
 
+UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"
+"""What is said of a system that is singular."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ReducedSystem:
@@ -49,8 +52,7 @@ def eliminate_points(
     layout: Layout, normal: NormalEquations, damping: float, workers: Workers
 ) -> ReducedSystem:
     """Return the reduced system, each diagonal entry of the full one raised by the factor 1 + damping."""
-    inverses = np.empty_like(normal.points)
-    _invert(normal.points, damping, inverses)
+    inverses = invert_points(normal, damping)
     diagonal = normal.nodes.copy()
     entries = np.einsum("naa->na", diagonal)
     entries *= 1.0 + damping
@@ -68,6 +70,13 @@ def eliminate_points(
 
     workers.share(layout.first_of_node, work, _ENTRIES_WORTH_A_THREAD)
     return ReducedSystem(diagonal=diagonal, pairs=pairs, right=right, inverses=inverses)
+
+
+def invert_points(normal: NormalEquations, damping: float) -> FloatArray:
+    """Return the inverses (k, 6) of the points' blocks, damped; packed as these."""
+    inverses = np.empty_like(normal.points)
+    _invert(normal.points, damping, inverses)
+    return inverses
 
 
 def step_points(

@@ -92,6 +92,11 @@ class CenterErrors:
     scale_sigma: float | None
     """Relative standard deviation of the scale; None where nothing in the problem sets it. From a tenth on,
     the covariances leave errors of the scale out: they are then those of the shape, in whatever scale."""
+    draws: FloatArray
+    """(n, 6, s) errors of the frames: centers in units of the world, then turns in rad, axes of the rig. The
+    sum over s of products of two frames' draws is their covariance; 0 and NaN as in the covariances."""
+    noise_px: float
+    """Standard deviation of an observation along an axis, by the residuals."""
 
 
 def estimate_center_errors(
@@ -126,7 +131,8 @@ def estimate_center_errors(
     _add_errors_of_priors(by_sample, problem, options, system, kappa)
     groups = max(by_group.shape[2], 2)
     pulled = by_group / kappa * np.sqrt(groups / (groups - 1.0)), by_sample / np.sqrt(_SAMPLES)
-    moves, scale_sigma = system.solve(np.concatenate(pulled, axis=2))[:, :3], None
+    draws, scale_sigma = system.solve(np.concatenate(pulled, axis=2)), None
+    moves = draws[:, :3]
     if not (system.free[6].any() or problem.fixed.any()):
         scale_sigma, same_scale = _split_scale(problem, system, moves)
         moves = same_scale if scale_sigma > METRIC_SIGMA else moves
@@ -136,6 +142,8 @@ def estimate_center_errors(
             score=evidence, own_px=calibration_px, shared_px=float(lens_errors_px.max(initial=0.0))
         ),
         scale_sigma=scale_sigma,
+        draws=system.by_frame(np.concatenate([moves, draws[:, 3:]], axis=1)),
+        noise_px=float(np.sqrt(noise2)) / kappa,
     )
 
 

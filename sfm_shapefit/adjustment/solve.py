@@ -4,33 +4,37 @@ import enum
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
+from sfm_shapefit.adjustment.divided import Parts, Pass, largest_share
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_baselines, restore_gauge
-from sfm_shapefit.adjustment.layout import Layout, lay_out
+from sfm_shapefit.adjustment.layout import SLOTS, Layout, lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
 from sfm_shapefit.adjustment.priors import add_priors, sum_priors
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.reduced_factor import choose_solver
+from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_solver
 from sfm_shapefit.adjustment.residuals import (
     NormalEquations,
     Values,
     linearize,
     reprojection_residuals,
 )
-from sfm_shapefit.adjustment.schur import eliminate_points, step_points
+from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points, step_points
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.executors import Crew
 from sfm_shapefit.base.losses import CAUCHY, loss, weighed
 from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
 
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12  # range of mu; rounding drowns what lies beyond
+# Rounding drowns what lies beyond 1e-12 and 1e12.
+_DAMPING = DampingRange(least=1e-12, most=1e12, growth=2.0, acceleration=2.0)
 _LEAST_GAIN = 1e-3  # share of the predicted decrease; a step of less is refused
 _ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in its rounding
 _NEAR = 1e-2  # relative fall of the cost by a step; after less the minimum is near, and the loss may bend
@@ -100,13 +104,19 @@ class Adjusted(Displayed):
 
 
 def adjust(
-    problem: AdjustmentProblem, options: AdjustmentOptions | None = None, **overrides: Any
+    problem: AdjustmentProblem,
+    options: AdjustmentOptions | None = None,
+    *,
+    crew: Crew | None = None,
+    **overrides: Any,
 ) -> Adjusted:
     """Minimize the reprojection errors over centers, points and what the options free.
 
     Args:
         problem: the start; it is not changed.
         options: settings, see `help(AdjustmentOptions)`; defaults if None.
+        crew: divides the observations among parts, see `divided`, for less memory here or elsewhere; the
+            answer is another one by rounding. None: they stay together.
         **overrides: single options by name: `adjust(problem, hold_rotations=True)`.
 
     Returns:
@@ -119,7 +129,7 @@ def adjust(
     options = merge_options(options, AdjustmentOptions, overrides)
     if problem.num_observations == 0:
         raise InputError("there is no observation, so there is nothing to adjust")
-    run = _Run(problem, options)
+    run = _Run(problem, options) if crew is None else _DividedRun(problem, options, crew)
     try:
         ending = run.iterate()
         run.linearize()
@@ -229,112 +239,200 @@ def linearize_all(
     return normal
 
 
+class _Told(NamedTuple):
+    """What a step that was tried says: a reason to stop, or None to go on from other equations."""
+
+    ending: Ending | None
+
+
 class _Run:
+    """Steps by observations that are all in this process."""
+
+    normal: NormalEquations
+
     def __init__(self, problem: AdjustmentProblem, options: AdjustmentOptions) -> None:
         self.problem, self.options = problem, options
         self.workers = Workers(options.threads)
-        self.layout = lay_out(problem, options)
+        self.layout = self.lay_out()
         hand_back_memory()  # what the layout was made of goes before the largest arrays come
-        self.factor = choose_solver(problem, self.layout, options, self.workers)
+        self.factor = self.choose_solver()
+        self.damping, self.bends, self.near = options.first_damping, False, _NEAR
         self.values, cost = self.settle(values_of(problem), _FIRST_SETTLING * options.settles_points)
-        self.damping, self.growth = options.first_damping, 2.0
         self.costs = [cost]
         self.gradient_norm, self.iterations = math.inf, 0
-        self.bends, self.near = False, _NEAR
+
+    def lay_out(self) -> Layout:
+        """Return the structure."""
+        return lay_out(self.problem, self.options)
+
+    def choose_solver(self) -> ReducedFactor:
+        """Return what systems are solved with."""
+        return choose_solver(self.problem, self.layout, self.options, self.workers)
+
+    @property
+    def least_curvature(self) -> float:
+        """How far the loss may bend, see `linearize`."""
+        return _LEAST_CURVATURE if self.bends else 1.0
 
     def settle(self, values: Values, steps: int) -> tuple[Values, float]:
         """Return values whose points have taken some steps by themselves, and the cost of all at these."""
         points, cost = settle_points(self.layout, values, self.options.loss_scale_px, self.workers, steps)
-        priors = sum_priors(self.problem, values, self.options.noise_px)
-        return replace(values, points=points), cost + priors
+        return replace(values, points=points), cost + self.cost_of_priors(values)
+
+    def cost_of_priors(self, values: Values) -> float:
+        """Return the cost of all that was known before, px^2."""
+        return sum_priors(self.problem, values, self.options.noise_px)
 
     def iterate(self) -> Ending:
         """Take steps until a reason to stop."""
         while True:
-            normal = self.linearize()
+            self.linearize()
             exact = 0.5 * self.problem.num_observations * _EXACT_PX**2
             if self.gradient_norm <= self.options.gradient_tolerance or self.costs[-1] <= exact:
                 return Ending.GRADIENT
-            ending = self.lower(normal)
-            if ending is not None:
-                return ending
-            # The next equations would else be held beside these.
-            del normal
-
-    def linearize(self) -> NormalEquations:
-        """Return the normal equations at the best values, and note their gradient."""
-        least = _LEAST_CURVATURE if self.bends else 1.0
-        normal = linearize_all(self.problem, self.layout, self.values, self.options, self.workers, least)
-        self.gradient_norm = _gradient_norm(normal, self.costs[-1])
-        return normal
-
-    def lower(self, normal: NormalEquations) -> Ending | None:
-        """Raise the damping until a step lowers the cost; return a reason to stop, or None to go on."""
-        while True:
-            if self.iterations >= self.options.max_iterations:
-                return Ending.MAX_ITERATIONS
-            before, bent = self.costs[-1], self.bends
-            predicted, accepted = self.attempt(normal)
-            if not accepted and predicted <= _ROUNDING * before:
-                return Ending.COST if self.gradient_norm <= _STATIONARY else Ending.STALLED
-            if accepted:
-                small = before - self.costs[-1] <= self.options.cost_tolerance * before
-                return Ending.COST if small else None
-            if bent:
-                return None
-            if self.damping > _MOST_DAMPING:
+            told, _ = take_damped_step(self.attempt, self.damping, _DAMPING)
+            self.forget()
+            if told is None:
                 return Ending.STALLED
+            if told.ending is not None:
+                return told.ending
 
-    def attempt(self, normal: NormalEquations) -> tuple[float, bool]:
-        """Try one step, take it if it lowers the cost; return the decrease predicted, and whether it did."""
+    def linearize(self) -> None:
+        """Make the normal equations at the best values, and note their gradient."""
+        self.normal = self.equations()
+        nodes, points = np.einsum("naa->na", self.normal.nodes), self.normal.points[:, [0, 3, 5]]
+        self.note_gradient(
+            largest_share(nodes, self.normal.node_gradients),
+            largest_share(points, self.normal.point_gradients),
+        )
+
+    def note_gradient(self, *largest: float) -> None:
+        """Note max_k |g_k| / sqrt(H_kk 2 cost) over all parameters (More 1978, the MINPACK test)."""
+        cost = self.costs[-1]
+        self.gradient_norm = math.sqrt(max(largest) / (2.0 * cost)) if cost else 0.0
+
+    def forget(self) -> None:
+        """Give up the equations: the next ones would else be held beside them."""
+        del self.normal
+
+    def equations(self) -> NormalEquations:
+        """Return the normal equations at the best values."""
+        given = self.problem, self.layout, self.values, self.options, self.workers
+        return linearize_all(*given, self.least_curvature)
+
+    def attempt(self, damping: float) -> "_Told | None":
+        """Try one step, take it if it lowers the cost; None asks for one of more damping."""
+        if self.iterations >= self.options.max_iterations:
+            return _Told(Ending.MAX_ITERATIONS)
         self.iterations += 1
         before = self.costs[-1]
-        proposal = self.propose(normal)
-        values, predicted = (self.values, math.inf) if proposal is None else proposal
-        values, after = (
-            (values, before) if proposal is None else self.settle(values, int(self.options.settles_points))
-        )
-        accepted = after < before and before - after >= _LEAST_GAIN * predicted
-        if accepted:
+        values, predicted, after = self.propose(damping) or (self.values, math.inf, before)
+        if after < before and before - after >= _LEAST_GAIN * predicted:
             gain = (before - after) / predicted if predicted > 0.0 else 1.0
             slower = max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
-            self.values, self.damping = values, max(self.damping * slower, _LEAST_DAMPING)
+            self.values, self.damping = values, max(damping * slower, _DAMPING.least)
             self.costs.append(after)
-            self.growth = 2.0
             is_near = before - after <= self.near * before
             self.bends = is_near and self.options.loss_scale_px is not None
-        elif self.bends:
-            self.bends, self.near = False, 0.1 * self.near
-        else:
-            self.damping *= self.growth
-            self.growth *= 2.0
-        return predicted, accepted
+            small = before - after <= self.options.cost_tolerance * before
+            return _Told(Ending.COST if small else None)
+        if predicted <= _ROUNDING * before:
+            return _Told(Ending.COST if self.gradient_norm <= _STATIONARY else Ending.STALLED)
+        if not self.bends:
+            return None
+        self.bends, self.near = False, 0.1 * self.near
+        return _Told(None)
 
-    def propose(self, normal: NormalEquations) -> tuple[Values, float] | None:
-        """Return the values after a damped step and the decrease predicted; None if it has no solution."""
-        layout, is_large = self.layout, len(normal.entries) > _MANY_ENTRIES
-        system = eliminate_points(layout, normal, self.damping, self.workers)
+    def propose(self, damping: float) -> tuple[Values, float, float] | None:
+        """Return the values after a damped step, the decrease predicted, and the cost; None without one."""
+        layout, normal = self.layout, self.normal
+        is_large = len(normal.entries) > _MANY_ENTRIES
+        system = eliminate_points(layout, normal, damping, self.workers)
         if is_large:
             normal.entries = normal.entries[:0].copy()
-        try:
-            self.factor.refactor(system)
-            steps = self.factor.solve(system.right[:, :, None])[:, :, 0]
-        except UnsolvableError:
-            steps = None
+        steps = self.solve(system)
         inverses = system.inverses
         del system
         if is_large:
             self.factor.give_back()
-            normal.entries = self.linearize().entries
+            normal.entries = self.equations().entries
         if steps is None:
             return None
         point_steps = step_points(layout, normal, inverses, steps, self.workers)
         diagonal = np.einsum("naa->na", normal.nodes)
         damped = float(np.sum(diagonal * steps**2) + np.sum(normal.points[:, [0, 3, 5]] * point_steps**2))
         slope = float(np.sum(normal.node_gradients * steps) + np.sum(normal.point_gradients * point_steps))
-        predicted = 0.5 * (self.damping * damped - slope)
+        predicted = 0.5 * (damping * damped - slope)
         values = move(layout, self.values, steps, point_steps)
-        return None if values is None or not math.isfinite(predicted) else (values, predicted)
+        if values is None or not math.isfinite(predicted):
+            return None
+        values, cost = self.settle(values, int(self.options.settles_points))
+        return values, predicted, cost
+
+    def solve(self, system: ReducedSystem) -> FloatArray | None:
+        """Return the steps of the nodes (N, 6); None if the system has no solution."""
+        try:
+            self.factor.refactor(system)
+            return self.factor.solve(system.right[:, :, None])[:, :, 0]
+        except UnsolvableError:
+            return None
+
+
+class _DividedRun(_Run):
+    """Steps by observations in parts, which a crew has."""
+
+    def __init__(self, problem: AdjustmentProblem, options: AdjustmentOptions, crew: Crew) -> None:
+        self.crew = crew
+        super().__init__(problem, options)
+
+    def lay_out(self) -> Layout:
+        """Divide the observations; return the structure without them."""
+        self.parts = Parts(self.problem, self.options, self.crew)
+        return self.parts.layout
+
+    def choose_solver(self) -> ReducedFactor:
+        """Return what systems are solved with."""
+        return choose_solver(self.problem, self.layout, self.options, self.workers, is_divided=True)
+
+    def settle(self, values: Values, steps: int) -> tuple[Values, float]:
+        """Return values whose points have taken some steps by themselves, and the cost of all at these."""
+        points, cost = self.parts.settle(values, self.how(self.damping), steps)
+        return replace(values, points=points), cost + self.cost_of_priors(values)
+
+    def how(self, damping: float) -> Pass:
+        """Return how parts are linearized now."""
+        return Pass(self.options.loss_scale_px, self.least_curvature, damping, self.crew.threads_of_task)
+
+    def linearize(self) -> None:
+        """Make the damped equations at the best values, and note their gradient."""
+        self.made = self.how(self.damping)
+        self.total = self.parts.linearize(self.values, self.made)
+        self.note_gradient(self.total.largest, largest_share(self.total.curvatures, self.total.gradients))
+
+    def forget(self) -> None:
+        """Give up the equations."""
+        del self.total
+
+    def propose(self, damping: float) -> tuple[Values, float, float] | None:
+        """Return the values after a damped step, the decrease predicted, and the cost; None without one."""
+        if self.made.damping != damping:  # after a step that was refused
+            self.made = self.made._replace(damping=damping)
+            self.total = self.parts.linearize(self.values, self.made)
+        total = self.total
+        steps = self.solve(total.system(self.layout.active))
+        self.factor.give_back()
+        total.diagonal, total.pairs = np.empty((2, 0, SLOTS, SLOTS))
+        moved = None if steps is None else move(self.layout, self.values, steps, np.zeros(3))
+        if steps is None or moved is None:
+            return None
+        settling = int(self.options.settles_points)
+        points, cost, (damped, slope) = self.parts.step(self.values, moved, steps, self.made, settling)
+        damped += np.sum(total.curvatures * steps**2)
+        slope += np.sum(total.gradients * steps)
+        predicted = float(0.5 * (damping * damped - slope))
+        if not math.isfinite(predicted):
+            return None
+        return replace(moved, points=points), predicted, cost + self.cost_of_priors(moved)
 
 
 def move(layout: Layout, values: Values, steps: FloatArray, point_steps: FloatArray) -> Values | None:
@@ -382,17 +480,3 @@ def _move_sensors(layout: Layout, values: Values, steps: FloatArray) -> tuple[Fl
     )
     translations[cameras] = -np.einsum("cab,cb->ca", rotations[cameras], after)
     return rotations, translations
-
-
-def _gradient_norm(normal: NormalEquations, cost: float) -> float:
-    """Return max_k |g_k| / sqrt(H_kk 2 cost) over all parameters (More 1978, the MINPACK test)."""
-    if cost == 0.0:
-        return 0.0
-    largest = 0.0
-    for diagonal, gradient in (
-        (np.einsum("naa->na", normal.nodes), normal.node_gradients),
-        (normal.points[:, [0, 3, 5]], normal.point_gradients),
-    ):
-        squares = np.divide(gradient**2, diagonal, out=np.zeros_like(gradient), where=diagonal > 0.0)
-        largest = max(largest, float(squares.max(initial=0.0)))
-    return math.sqrt(largest / (2.0 * cost))

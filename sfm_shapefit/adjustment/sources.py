@@ -11,6 +11,7 @@ from sfm_shapefit.adjustment.views import CUBE, views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import connected_components
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
@@ -42,14 +43,14 @@ def collect_matches(
         InputError: if a match refers to a keypoint that its image does not have.
     """
     counts = np.array([pictures.count(k) for k in range(images.num_images)], dtype=np.int64)
-    begins = np.append(0, np.cumsum(counts))
+    begins = offsets_of(counts)
     number = np.uint32 if begins[-1] < 2**32 else np.int64
     # Memory is taken as rows are written; one array of each batch, to be joined, would take it twice.
     room, end = np.empty((num_matches, 2), dtype=number), 0
     is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
     for batch in batches:
         kept = (place[batch.pairs] >= 0).all(axis=1)
-        lengths, own = np.diff(batch.offsets), batch.keypoints
+        lengths, own = batch.lengths(), batch.keypoints
         if not kept.all():
             lengths, own = lengths[kept], own[np.repeat(kept, lengths)]
         ends = place[batch.pairs[kept]]

@@ -11,7 +11,7 @@ from matches fit better here: on fountain-P11, Herz-Jesus-P25, castle-P30 and le
 and 4.3 % more observations, with mean errors of 0.44 instead of 0.53, 0.58 (0.71), 0.41 (0.51) and 0.47 px
 (0.65). The mean length of tracks is 4.60 (4.54), 5.64 (5.54), 4.91 (4.95) and 4.59 (4.66).
 
-No sample is random: the same input gives the same bits. An executor's workers have no part in it: to send
+No sample is random: the same input gives the same bits. The workers of a cluster have no part in it: to send
 them the tracks takes as long as they would save.
 
 Source: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016, section 4.3.
@@ -25,6 +25,7 @@ from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import IntArray, hand_back_memory
 from sfm_shapefit.base.executors import Advance, nobody
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points, concatenate_points, number_points
 from sfm_shapefit.tracks.links import ObservedTracks
@@ -81,9 +82,9 @@ def triangulate(
         hand_back_memory()  # before the rays of all keypoints take some
         joined = matched.join(poses, limit_px, threads)
         if limit_px < joining_limits[-1]:  # two keypoints may find a third one in the next joining
-            sizes = np.diff(joined.offsets)
+            sizes = joined.lengths()
         else:  # two keypoints count 2 if they have no other partner, 3 or more if one has
-            sizes = np.diff(np.append(0, np.cumsum(partners[joined.rows]))[joined.offsets])
+            sizes = np.diff(offsets_of(partners[joined.rows])[joined.offsets])
         chosen, is_left = np.flatnonzero(sizes >= fewest), np.ones_like(partners, dtype=np.bool_)
         done = 0
         for own in map(joined.subset, _blocks(chosen)):

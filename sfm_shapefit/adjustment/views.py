@@ -17,6 +17,7 @@ import numpy as np
 from sfm_shapefit.adjustment.freedom import GivenPoses
 from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points
@@ -104,7 +105,7 @@ class Views:
         lengths = np.bincount(found.points_seen[used], minlength=len(found.points))
         return Points(
             xyz=found.points,
-            offsets=np.append(0, np.cumsum(lengths)),
+            offsets=offsets_of(lengths),
             images=self.images[tracks.cameras[used]],
             keypoints=tracks.keypoints[used],
             ids=1 + np.arange(len(lengths)) if tracks.may_split else tracks.ids[found.tracks],

@@ -44,29 +44,6 @@ def distinct(numbers: IntArray) -> IntArray:
     return ordered[is_new]
 
 
-def rows_of_parts(offsets: IntArray, chosen: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the offsets and the rows of some parts, part p having the rows offsets[p]:offsets[p + 1]."""
-    counts = np.diff(offsets)[chosen]
-    ends = np.append(0, np.cumsum(counts))
-    return ends, np.repeat(offsets[chosen] - ends[:-1], counts) + np.arange(ends[-1])
-
-
-class Lists:
-    """Lists of rows of a table, one after the other: list k has the rows offsets[k]:offsets[k + 1]."""
-
-    __slots__ = ()
-    offsets: IntArray
-    """(k + 1,)"""
-
-    def lengths(self) -> IntArray:
-        """Return the number of rows of each list, (k,)."""
-        return np.diff(self.offsets)
-
-    def list_of_rows(self) -> IntArray:
-        """Return the list that each row stands in."""
-        return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
-
-
 def rows_taken(columns: Columns, rows: IntArray | BoolArray) -> Columns:
     """Return some rows of a tuple of arrays that all have the same, in that order."""
     return columns._make(column[rows] for column in columns)

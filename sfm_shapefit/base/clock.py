@@ -2,11 +2,11 @@
 
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from sfm_shapefit.base.arrays import begin_run, hand_back_memory
+from sfm_shapefit.base.executors import Cluster, Crew
 from sfm_shapefit.base.threads import count_threads
 
 Progress = Callable[[str, int, int], None]
@@ -20,22 +20,27 @@ class Clock:
     progress: Progress = field(default=lambda _stage, _done, _total: None)
     seconds: dict[str, float] = field(default_factory=dict)
     stage: str = ""
-    executor: Executor | None = None
-    """Shares out pairs among its workers; None: all is done in this process."""
+    cluster: Cluster | None = None
+    """Workers who share the work; None: all is done in this process."""
     threads: int = field(default_factory=count_threads)
     """Threads of this process."""
 
     @classmethod
-    def of(cls, progress: Progress | None, threads: int = 0, executor: Executor | None = None) -> "Clock":
+    def of(cls, progress: Progress | None, threads: int = 0, cluster: Cluster | None = None) -> "Clock":
         """Begin a run whose caller may want to hear of its progress; 0 threads are one per core."""
         begin_run()
-        clock = cls(executor=executor, threads=count_threads(threads))
+        clock = cls(cluster=cluster, threads=count_threads(threads))
         clock.progress = progress or clock.progress
         return clock
 
+    @property
+    def crew(self) -> Crew:
+        """Who works."""
+        return Crew(self.threads, self.cluster)
+
     def anew(self) -> "Clock":
         """Return a clock of the same run that has measured nothing."""
-        return Clock(self.progress, executor=self.executor, threads=self.threads)
+        return Clock(self.progress, cluster=self.cluster, threads=self.threads)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:

@@ -1,10 +1,13 @@
-"""Work shared out among threads or to any `concurrent.futures` executor; answers come in order."""
+"""Work shared out among threads, or among the workers of a cluster; answers come in order."""
 
+from asyncio import CancelledError
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar
 
 from sfm_shapefit.base.errors import ShapeFitError
 
@@ -52,44 +55,96 @@ def made_ahead(threads: int, items: Iterator[Answer]) -> Iterator[Answer]:
 
 
 class WorkerError(ShapeFitError):
-    """A worker died, or the scheduler could not be reached."""
+    """A worker died too often, or the scheduler could not be reached."""
 
 
-def answers(
-    executor: Executor, work: Callable[[Task], Answer], tasks: Iterable[Task]
-) -> Iterator[tuple[Task, Answer]]:
-    """Yield each task with what an executor's workers make of it, in the order of the tasks.
+class Cluster(Protocol):
+    """Workers elsewhere; `pipeline.execution` has those of dask."""
 
-    Args:
-        executor: submits tasks, a few ahead of the answers; it is not shut down.
-        work: a function of a module, so that other processes find it; what it raises is raised.
-        tasks: its arguments, which are pickled on the way to other processes.
+    def submit(self, work: Callable[..., Answer], *given: Any) -> Any:
+        """Return a future of `work(*given)`, whose arguments may be futures; what is lost is made anew."""
 
-    Raises:
-        WorkerError: if a worker died and the executor does not replace it.
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Crew:
+    """Who shares the work of a run: threads of this process, and the workers of a cluster, if there is one.
+
+    Answers do not depend on who works, as long as `work` is a function of its arguments alone. On a cluster
+    it is one of a module, so that other processes find it, and what it is given and returns is pickled.
     """
-    sent: deque[tuple[Task, Future[Answer]]] = deque()
-    try:
-        for task in tasks:
-            sent.append((task, executor.submit(work, task)))
-            if len(sent) == _TASKS_AT_ONCE:
-                first, future = sent.popleft()
-                yield first, _answer(future)
-        while sent:
-            first, future = sent.popleft()
-            yield first, _answer(future)
-    finally:
-        for _, future in sent:
-            future.cancel()
+
+    threads: int
+    """Threads of this process."""
+    cluster: Cluster | None = None
+    divides: bool = False
+    """Whether adjustments of any size are divided, for memory."""
+
+    @property
+    def threads_of_task(self) -> int:
+        """Threads that one task may take; workers take several tasks at once instead."""
+        return self.threads if self.cluster is None else 1
+
+    def keep(self, work: Callable[..., Answer], *given: Iterable[Any]) -> list[Any]:
+        """Return what `work` makes of each task, or where that is kept, to be an argument of other tasks.
+
+        Args:
+            work: a function.
+            given: its arguments, one item of each for a task.
+        """
+        if self.cluster is None:
+            return list(map(work, *given))
+        with _failures_told():
+            return [self.cluster.submit(work, *task) for task in zip(*given, strict=True)]
+
+    def share(self, value: Answer) -> Any:
+        """Return a value, or where it is kept, as an argument of many tasks; it is sent once."""
+        return self.keep(_same, [value])[0]
+
+    def stream(self, work: Callable[..., Answer], *given: Iterable[Any]) -> Iterator[Answer]:
+        """Yield what `work` makes of each task, in their order; arguments as of `keep`, which may be kept.
+
+        Raises:
+            WorkerError: if a task failed on a cluster again and again.
+        """
+        if self.cluster is None:
+            yield from map(work, *given)
+            return
+        sent: deque[Any] = deque()
+        try:
+            for task in zip(*given, strict=True):
+                with _failures_told():
+                    sent.append(self.cluster.submit(work, *task))
+                if len(sent) == _TASKS_AT_ONCE:
+                    yield _answer(sent.popleft())
+            while sent:
+                yield _answer(sent.popleft())
+        finally:
+            for future in sent:
+                future.cancel()
 
 
-def _answer(future: Future[Answer]) -> Answer:
-    try:
+HERE = Crew(0)
+"""The threads of this process, one per core."""
+
+
+def _same(value: Answer) -> Answer:
+    return value
+
+
+def _answer(future: Any) -> Any:
+    with _failures_told():
         return future.result()
+
+
+@contextmanager
+def _failures_told() -> Iterator[None]:
+    """Raise what a cluster raises in one sentence; what the work itself says passes as it is."""
+    try:
+        yield
     except ShapeFitError:
         raise
-    except Exception as error:
+    except (Exception, CancelledError) as error:
         what = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise WorkerError(
-            f"a worker failed ({what}); check its memory and that it sees the database, and run again"
+            f"the workers failed ({what}); look at their logs and memory, and at the scheduler, and run again"
         ) from error

@@ -48,4 +48,5 @@ _special = _functions("scipy.special", "_ufuncs", "scipy.special")
 _lapack = _functions("scipy.linalg", "_flapack", "scipy.linalg.lapack")
 
 expit, logit, gammaln, chdtri = _special.expit, _special.logit, _special.gammaln, _special.chdtri
+xlogy = _special.xlogy
 dpotrs, dgeqp3 = _lapack.dpotrs, _lapack.dgeqp3

@@ -26,8 +26,10 @@ from sfm_shapefit.cli.flags import (
     Json,
     ModelArgument,
     Quiet,
+    ScaleBarsFile,
     one_path,
 )
+from sfm_shapefit.cli.forecast import PLANS
 from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
 
@@ -51,6 +53,7 @@ def check_command(
         typer.Option("--report", metavar="FILE", help="Write a page that explains the verdict to FILE."),
     ] = None,
     images: ImageFolder = None,
+    scale_bars: ScaleBarsFile = None,
     max_minutes: Annotated[
         float | None,
         typer.Option(
@@ -87,7 +90,10 @@ def check_command(
         from sfm_shapefit.files.model_folder import model_folders, refuse_no_model
 
         if len(model_folders(source)) > 1:
-            _refuse_of_many({"--report": report, "--second-opinion": second_opinion, "--images": images})
+            _refuse_of_many(
+                {"--report": report, "--second-opinion": second_opinion, "--images": images}
+                | {"--scale-bars": scale_bars}
+            )
             is_usable = _check_pieces(source, database, not no_second_opinion, as_json=as_json, quiet=quiet)
             raise typer.Exit(EXIT_UNSOLVABLE if strict and not is_usable else 0)
         refuse_no_model(source)
@@ -96,22 +102,25 @@ def check_command(
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.check import check
         from sfm_shapefit.pipeline.inputs import choose_inputs
+        from sfm_shapefit.pipeline.lengths import judge_bars
         from sfm_shapefit.pipeline.write import refuse_file
 
         known = choose_inputs(source, database).database
         if second_opinion is not None and no_second_opinion:
             raise InputError("--second-opinion and --no-second-opinion contradict each other; give one")
         _refuse_without_use(known, images, report, second_opinion, max_minutes)
-        inputs = [path for path in (source, known, images) if path is not None]
+        inputs = [path for path in (source, known, images, scale_bars) if path is not None]
         if report is not None:  # now, not when all is computed
             if report.exists() and not overwrite and (images is None or known is not None):
                 read_source(source, database)  # what is wrong with that is said first
             refuse_file(report, overwrite=overwrite, protect=inputs)
+        plan = () if known is None or no_second_opinion else PLANS["MODEL with a database"]
+        bars = None if scale_bars is None else judge_bars(source, scale_bars)
         with (
             claimed_output(second_opinion, overwrite=overwrite, protect=inputs)
             if second_opinion
             else nullcontext(),
-            show_progress(not (quiet or as_json)) as progress,
+            show_progress(not (quiet or as_json), plan=plan) as progress,
             hear_pycolmap(False),
         ):
             found = check(
@@ -122,7 +131,7 @@ def check_command(
                 second_opinion=not no_second_opinion,
                 progress=progress,
             )
-            found = _keep_second(found, second_opinion, overwrite=overwrite)
+            found = _keep_second(found.with_bars(bars), second_opinion, overwrite=overwrite)
         if report is not None:
             found.report(report, images=images or "", overwrite=overwrite)
         if as_json:

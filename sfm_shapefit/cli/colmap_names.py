@@ -45,8 +45,17 @@ _NEEDLESS = {
 """Options of COLMAP that are not needed here, and what to do."""
 
 
+_GONE = {"--executor": "threads share all work; for other machines there is --scheduler"}
+"""Flags of earlier versions, and what to do instead."""
+
+
 def answer_for(flag: str, known: set[str]) -> str | None:
-    """Return what a flag of COLMAP's is in a command that has the `known` flags; None if it is none."""
+    """Return what a flag of COLMAP's, or of an earlier version, is here; None if it is none.
+
+    The command has the `known` flags.
+    """
+    if flag in _GONE:
+        return f"{flag} is gone: {_GONE[flag]}"
     group, _, name = flag.removeprefix("--").rpartition(".")
     here = _OPTIONS.get(name, f"--{name.replace('_', '-')}")
     if name in _NEEDLESS:

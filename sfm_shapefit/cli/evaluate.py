@@ -9,7 +9,15 @@ from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import rounded
 from sfm_shapefit.cli.console import print_json, print_table, report_errors
-from sfm_shapefit.cli.flags import GroupedCommand, InputPath, Json, ModelArgument, one_path
+from sfm_shapefit.cli.flags import (
+    GroupedCommand,
+    InputPath,
+    Json,
+    ModelArgument,
+    ScaleBarsFile,
+    one_path,
+    split_values,
+)
 from sfm_shapefit.cli.root import app
 
 if TYPE_CHECKING:
@@ -24,7 +32,7 @@ _TABLES = {".csv", ".txt"}
 @app.command(
     "evaluate",
     cls=GroupedCommand,
-    short_help="Compare a model's poses with those of a reference.",
+    short_help="Compare a model's poses with a reference, or its lengths with scale bars.",
     epilog="Example: sfm-shapefit evaluate out truth --csv errors.csv",
 )
 def evaluate_command(
@@ -33,7 +41,8 @@ def evaluate_command(
         Path | None,
         typer.Argument(
             metavar="REF",
-            help="Model with the true poses, also transforms.json, or a table (.csv, .txt) of positions.",
+            help="Model with the true poses, also transforms.json, or a table (.csv, .txt) of positions; "
+            "without it: how well lengths of MODEL are known.",
         ),
     ] = None,
     *,
@@ -52,6 +61,15 @@ def evaluate_command(
             "--trajectory", help="Also ATE and RPE, as evo defines them, of the images in the order of names."
         ),
     ] = False,
+    length: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--length",
+            metavar="PLACE PLACE",
+            help="The distance of two images, by name, or 3D points, by id; without REF; may be repeated.",
+        ),
+    ] = None,
+    scale_bars: ScaleBarsFile = None,
     csv: Annotated[
         Path | None, typer.Option("--csv", metavar="FILE", help="Write one row per camera to FILE.")
     ] = None,
@@ -61,9 +79,17 @@ def evaluate_command(
         bool, typer.Option("--verbose", "-v", help="Also AUC of relative poses, and recall.")
     ] = False,
 ) -> None:
-    """Compare the camera poses of MODEL with those of REF, after a robust similarity alignment."""
+    """Compare the camera poses of MODEL with those of REF, after a robust similarity alignment.
+
+    Without REF: how well lengths of MODEL are known, and how it compares with scale bars.
+    """
     source = one_path(model, input_path, "MODEL")
+    if reference is None and not (threshold or trajectory or csv):
+        _tell_lengths(source, length or [], scale_bars, as_json=as_json)
+        return
     truth = one_path(reference, None, "REF")
+    if length or scale_bars:
+        raise typer.BadParameter("lengths and scale bars are of MODEL alone; leave REF out", param_hint="REF")
     with report_errors():
         from sfm_shapefit.base.atomic_folder import atomic_file
         from sfm_shapefit.base.paths import refuse_absent
@@ -89,6 +115,20 @@ def evaluate_command(
         else:
             title = f"{source} against {truth}"
             print_table(title, _told(errors, verbose=verbose or bool(threshold)), "see --json")
+
+
+def _tell_lengths(source: Path, lengths: list[str], bars: Path | None, *, as_json: bool) -> None:
+    """Print how well lengths of a model are known."""
+    with report_errors():
+        from sfm_shapefit.base.paths import refuse_absent
+        from sfm_shapefit.pipeline.lengths import evaluate_lengths
+
+        refuse_absent(source, *filter(None, [bars]))
+        found = evaluate_lengths(source, [split_values("length", one) for one in lengths], scale_bars=bars)
+        if as_json:
+            print_json(found.summary())
+        else:
+            print_table(str(source), found.told(), "see --json")
 
 
 def _told(errors: "Evaluation | PositionEvaluation", *, verbose: bool) -> list[Row]:

@@ -39,25 +39,18 @@ PriorsFile = Annotated[
         "--priors",
         metavar="FILE|FOLDER|database",
         help="Position priors of a file (name x y z [sigma], a table with a header, COLMAP's JSON), of the "
-        "EXIF data of a folder of images, or of the database; standard deviations make them pull.",
+        "EXIF data of a folder of images, or of the database; those with standard deviations also hold the "
+        "cameras.",
     ),
 ]
 
 
-def _check_executor(name: str) -> str:
-    if not re.fullmatch("serial|processes|dask(:.+)?", name):
-        raise typer.BadParameter(f"{name!r} is not one of serial, processes, dask, dask:ADDRESS")
-    return name
-
-
-ExecutorName = Annotated[
+Scheduler = Annotated[
     str,
     typer.Option(
-        "--executor",
-        metavar="serial|processes|dask[:ADDRESS]",
-        callback=_check_executor,
-        help="Where pairs are measured: in this process, in as many others as --threads says, or on a "
-        "cluster of dask, started here or that of a running scheduler's address.",
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Address of a dask scheduler, whose workers share the work; see docs/distributed.md.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
@@ -73,6 +66,13 @@ ImageFolder = Annotated[
     ),
 ]
 
+ScaleBarsFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--scale-bars", metavar="FILE", help="Known lengths between points, as of `locate`, to compare with."
+    ),
+]
+
 _ALSO = {"quiet": "-q", "verbose": "-v", "images": "--image_path"}
 
 _METAVARS: dict[Any, str] = {
@@ -80,10 +80,14 @@ _METAVARS: dict[Any, str] = {
     "fix": "FILE|solved",
     "without": "FILE",
     "control_points": "FILE",
+    "scale_bars": "FILE",
+    "length": "PLACE PLACE",
     "gravity": "FILE|database",
     "rotations": "auto|held|free|SIGMA_DEG",
     "config": "FILE",
     "images": "FOLDER",
+    "mask_path": "FOLDER",
+    "rig_config_path": "FILE",
     int: "INTEGER",
     float: "NUMBER",
     int | None: "INTEGER",
@@ -91,7 +95,7 @@ _METAVARS: dict[Any, str] = {
 }
 """Placeholder of a flag's value in the help, by the field's name or else by its type."""
 
-_REPEATED = {"known_distance": (str, str, float)}
+_REPEATED = {"known_distance": (str, str, float), "length": (str, str)}
 """Repeatable flags of several values, which typer has no way to declare, and the types of these values."""
 
 _WORDS_OR_NUMBERS = {"rotations"}
@@ -316,7 +320,7 @@ def _gather_values(args: Sequence[str]) -> list[str]:
     return gathered + waiting
 
 
-def _values_of(name: str, text: str) -> tuple[Any, ...]:
+def split_values(name: str, text: str) -> tuple[Any, ...]:
     """Return the values of a repeated flag that `_gather_values` made one."""
     try:
         return tuple(kind(part) for kind, part in zip(_REPEATED[name], text.split(_JOINT), strict=True))
@@ -344,7 +348,7 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
     in_file = _read_toml(config, settings) if config else {}
     flags = {name: value for name, value in given.items() if value is not None and name in known}
     for name in _REPEATED.keys() & flags.keys():
-        flags[name] = tuple(_values_of(name, text) for text in flags[name])
+        flags[name] = tuple(split_values(name, text) for text in flags[name])
     flags |= {name: _word_or_number(flags[name]) for name in _WORDS_OR_NUMBERS & flags.keys()}
     try:
         return settings(**in_file | flags)
@@ -387,7 +391,7 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
 
 def _describe_unknown(name: str, known: Sequence[str]) -> str:
     """Say what a key is that this command does not know: a flag, another command's, or a typo."""
-    if name in {"database", "priors", "executor", *homes_of(OutputFlags)}:
+    if name in {"database", "priors", "scheduler", *homes_of(OutputFlags)}:
         return f"is no key of a file; give it as a flag: {_flag_of(name)}"
     others = _commands_with(name)
     return f"is an option of {others}" if others else f"is no option; {hint(name, known)}"

@@ -4,7 +4,6 @@ from typing import Any
 
 from sfm_shapefit.cli.flags import (
     Database,
-    ExecutorName,
     GroupedCommand,
     InputPath,
     ModelArgument,
@@ -12,6 +11,7 @@ from sfm_shapefit.cli.flags import (
     OutputFlags,
     OutputPath,
     PriorsFile,
+    Scheduler,
     flags_of,
     one_path,
     takes,
@@ -21,8 +21,8 @@ from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.command_options import LocateOptions
 
 _FLAGS = (
-    *("control_points", "known_distance", "fix", "without", "rotations", "intrinsics", "rigs", "adjust"),
-    *("scale", "min_trust", "points", "threads", "max_memory_mb"),
+    *("control_points", "scale_bars", "known_distance", "fix", "without", "rotations", "intrinsics"),
+    *("rigs", "adjust", "scale", "min_trust", "points", "threads", "max_memory_mb"),
 )
 """Options that are flags; the others are keys of --config."""
 
@@ -42,7 +42,7 @@ def locate_command(
     output_path: OutputPath = None,
     database: Database = None,
     priors: PriorsFile = None,
-    executor: ExecutorName = "serial",
+    scheduler: Scheduler = "",
     **given: Any,
 ) -> None:
     """Find positions and points from the rotations of MODEL and its matches; write the model to OUT.
@@ -52,11 +52,11 @@ def locate_command(
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
     with command_run(LocateOptions, given, target, [source, database, priors]) as run:
-        from sfm_shapefit.pipeline.execution import open_executor
+        from sfm_shapefit.pipeline.execution import open_client
         from sfm_shapefit.pipeline.locate import locate
 
-        with open_executor(executor, run.options.placement.solver.num_threads()) as workers:
+        with open_client(scheduler) as client:
             found = locate(
-                source, database, options=run.options, progress=run.progress, priors=priors, executor=workers
+                source, database, options=run.options, progress=run.progress, priors=priors, client=client
             )
         run.finish(found, source, target)

@@ -8,12 +8,12 @@ import typer
 
 from sfm_shapefit.base.settings import homes_of
 from sfm_shapefit.cli.flags import (
-    ExecutorName,
     GroupedCommand,
     OutArgument,
     OutputFlags,
     OutputPath,
     PriorsFile,
+    Scheduler,
     flags_of,
     one_path,
     read_options,
@@ -25,8 +25,18 @@ from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.files.matching_options import MatchingOptions
 
 _FLAGS = (
-    *("control_points", "known_distance", "gravity", "without", "intrinsics", "rigs", "adjust", "scale"),
-    *("join", "min_trust", "min_points_per_image", "min_model_size", "points", "threads", "max_memory_mb"),
+    *("control_points", "scale_bars", "known_distance", "gravity", "without", "intrinsics", "rigs"),
+    *(
+        "adjust",
+        "scale",
+        "join",
+        "min_trust",
+        "min_points_per_image",
+        "min_model_size",
+        "points",
+        "threads",
+        "max_memory_mb",
+    ),
 )
 """Options that are flags; the others are keys of --config."""
 
@@ -50,7 +60,7 @@ def map_command(
     database_path: Annotated[Path | None, typer.Option("--database_path", hidden=True)] = None,
     output_path: OutputPath = None,
     priors: PriorsFile = None,
-    executor: ExecutorName = "serial",
+    scheduler: Scheduler = "",
     **given: Any,
 ) -> None:
     """Make models from the matches of DATABASE; write them to OUT/0, OUT/1, ..., the largest first.
@@ -62,14 +72,14 @@ def map_command(
     target = one_path(out, output_path, "OUT")
     made = _database_to_make(source, target, given)
     with command_run(MapOptions, given, target, [source, priors], "DATABASE OUT", made) as run:
-        from sfm_shapefit.pipeline.execution import open_executor
+        from sfm_shapefit.pipeline.execution import open_client
         from sfm_shapefit.pipeline.map import map_database
 
         if made is not None:
             _match(source, made, given, run)
-        with open_executor(executor, run.options.placement.solver.num_threads()) as workers:
+        with open_client(scheduler) as client:
             found = map_database(
-                made or source, run.options, progress=run.progress, priors=priors, executor=workers
+                made or source, run.options, progress=run.progress, priors=priors, client=client
             )
         run.finish(found if made is None else replace(found, images=source), source, target)
 

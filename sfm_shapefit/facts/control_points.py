@@ -7,7 +7,7 @@ import numpy as np
 
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.placement.control_points import ControlFit, TriangulatedControl
+from sfm_shapefit.placement.control_points import ControlFit, TriangulatedMarks
 from sfm_shapefit.scene.given import ControlPoints
 
 
@@ -39,9 +39,7 @@ class ControlPoint(Record):
         ]
 
 
-def control_rows(
-    known: ControlPoints, found: TriangulatedControl, fit: ControlFit | str
-) -> list[ControlPoint]:
+def control_rows(known: ControlPoints, found: TriangulatedMarks, fit: ControlFit | str) -> list[ControlPoint]:
     """Return the row of each point in locate.json."""
     fitted = fit if isinstance(fit, ControlFit) else None
     rows = []
@@ -67,11 +65,11 @@ def control_rows(
 
 
 def control_warnings(
-    known: ControlPoints, found: TriangulatedControl, fit: ControlFit | str, names: Sequence[str]
+    known: ControlPoints, found: TriangulatedMarks, fit: ControlFit | str, names: Sequence[str]
 ) -> Iterator[str]:
     """Yield what is wrong with the points or their marks, a sentence each; `names` are of the images."""
     if isinstance(fit, str):
-        yield f"{fit}: the model does not stand in the axes of the control points"
+        yield f"{fit}: the model is not in the axes of the control points"
     else:
         there = np.isfinite(fit.residuals[:, 0])
         errors = np.where(there & ~known.is_check & ~fit.fitting, np.linalg.norm(fit.residuals, axis=1), 0.0)

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.facts.joins import JoinOutcome
+from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.rows import correlations_of, covariances_of
 from sfm_shapefit.facts.tables import CameraRow, Table
@@ -29,7 +29,7 @@ class JoinedGroup(NamedTuple):
     reconstruction: "pycolmap.Reconstruction"
     world_from: Mapping[int, Similarity]
     """By the number of each model, the first one's first."""
-    joins: Sequence[JoinOutcome]
+    joins: Sequence[JoinFacts]
     tied: Sequence[tuple[str, str]] = ()
     """Images of models that are joined, which stand rightly to one another as far as the joins do."""
 
@@ -64,8 +64,8 @@ def _variances_of_joins(group: JoinedGroup) -> dict[int, float]:
     found = dict.fromkeys(group.world_from, 0.0)
     for done in group.joins:  # ascending, so that the model that it is joined to is there
         assert done.join is not None
-        sigma = group.world_from[done.to].scale * done.join.center_sigma
-        found[done.model] = found[done.to] + sigma**2 / 3.0
+        sigma = group.world_from[done.to_number].scale * done.join.center_sigma
+        found[done.number] = found[done.to_number] + sigma**2 / 3.0
     return found
 
 

@@ -1,7 +1,7 @@
 """What is said of a model beside another: joined to it, how and how surely, or why not."""
 
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Sequence
+from typing import Annotated, Self
 
 from sfm_shapefit.base.geometry import Alignment
 from sfm_shapefit.base.record import Record
@@ -16,7 +16,7 @@ class JoinFacts(Record):
     model: Annotated[str, "Its folder."]
     to: Annotated[str, "The folder of the model that it was to be joined to."]
     joined: Annotated[bool, "Whether it was."]
-    folder: Annotated[str | None, "Where both stand in one world; null if they are not joined."]
+    folder: Annotated[str | None, "Where both stand in one world; null if they are not joined."] = None
     statement: Annotated[str, "How and how surely, or why not, in words."]
     scale_sigma: Annotated[float | None, "Relative standard deviation of the scale between them."] = None
     turn_sigma_deg: Annotated[float | None, "Standard deviation of the turn between them."] = None
@@ -35,57 +35,62 @@ class JoinFacts(Record):
     agreeing_pairs: Annotated[int, "Pairs of images between it and the models joined with it that agree."]
     contradicting_pairs: Annotated[int, "Those that do not."]
     rival_pairs: Annotated[list[tuple[str, str]], "Those among them that agree on another join, by names."]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JoinOutcome:
-    """A model beside another, and what came of joining it to that."""
-
-    model: int
-    to: int
-    """The number of the model that it was joined to, or to be joined to."""
+    number: int
+    to_number: int
+    """The numbers of the two models."""
     found: PieceJoin | None
     """The join, refused or not; None if there was none to judge."""
-    reason: str = ""
+    reason: str
     """Why it was not joined, a clause."""
-    labels: tuple[str, str]
-    """What the two are called."""
-    rivals: tuple[tuple[str, str], ...] = ()
-    """Pairs of images that agree on another join."""
+
+    @classmethod
+    def of_models(
+        cls, labels: Sequence[str], number: int, found: PieceJoin | str, rivals: list[tuple[str, str]]
+    ) -> Self:
+        """Return what came of joining a model to another.
+
+        Args:
+            labels: what all models are called.
+            number: that of the model.
+            found: the join, refused or not; or why there is none, to the first model.
+            rivals: pairs of images that agree on another join, by their names.
+        """
+        join, to = (None, 0) if isinstance(found, str) else (found, found.to)
+        reason = found if isinstance(found, str) else found.reason
+        solved = join and join.solved
+        return cls.taken_from(
+            join,
+            model=labels[number].removeprefix("model "),
+            to=labels[to].removeprefix("model "),
+            joined=not reason,
+            statement=_tell_join((labels[number], labels[to]), found, rivals),
+            similarity=join and join.to_from_piece.facts,
+            solve=solved and solved.facts,
+            agreeing_pairs=0 if join is None else len(join.agreeing),
+            contradicting_pairs=0 if join is None else len(join.contradicting),
+            rival_pairs=rivals,
+            number=number,
+            to_number=to,
+            found=join,
+            reason=reason,
+        )
 
     @property
     def join(self) -> PieceJoin | None:
         """The join, if it was accepted."""
         return None if self.reason else self.found
 
-    @property
-    def statement(self) -> str:
-        """Say it in one sentence."""
-        (own, other), join = self.labels, self.join
-        named = first_of([f"{a} and {b}" for a, b in self.rivals])
-        if join is None:
-            return f"{own} is not joined to {other}: {self.reason}" + (f" ({named})" if named else "")
-        rival = f"; {counted(len(self.rivals), 'pair')} would have it elsewhere ({named})" if named else ""
-        return (
-            f"{own} is joined to {other} by {join.evidence}: scale known to "
-            f"{100.0 * join.scale_sigma:.2g} %, turn to {join.turn_sigma_deg:.2g} deg, its cameras to "
-            f"{join.center_sigma:.2g} units of {other}{rival}"
-        )
 
-    def facts(self, folder: str | None) -> JoinFacts:
-        """Return what stands in the files of the result; `folder` is where both stand in one world."""
-        found = self.found
-        solved = found and found.solved
-        return JoinFacts.taken_from(
-            found,
-            model=self.labels[0].removeprefix("model "),
-            to=self.labels[1].removeprefix("model "),
-            joined=self.join is not None,
-            folder=folder,
-            statement=self.statement,
-            similarity=found and found.to_from_piece.facts,
-            solve=solved and solved.facts,
-            agreeing_pairs=0 if found is None else len(found.agreeing),
-            contradicting_pairs=0 if found is None else len(found.contradicting),
-            rival_pairs=list(self.rivals),
-        )
+def _tell_join(labels: tuple[str, str], found: PieceJoin | str, rivals: list[tuple[str, str]]) -> str:
+    """Say in one sentence what came of a join of two models."""
+    own, other = labels
+    named = first_of([f"{a} and {b}" for a, b in rivals])
+    if isinstance(found, str) or found.reason:
+        why = found if isinstance(found, str) else found.reason
+        return f"{own} is not joined to {other}: {why}" + (f" ({named})" if named else "")
+    rival = f"; {counted(len(rivals), 'pair')} put it elsewhere ({named})" if named else ""
+    return (
+        f"{own} is joined to {other} by {found.evidence}: scale known to "
+        f"{100.0 * found.scale_sigma:.2g} %, turn to {found.turn_sigma_deg:.2g} deg, its cameras to "
+        f"{found.center_sigma:.2g} units of {other}{rival}"
+    )

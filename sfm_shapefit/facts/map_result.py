@@ -15,7 +15,7 @@ from sfm_shapefit.base.display import Row, Telling, Written, row
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted, reasons_by_place
 from sfm_shapefit.facts.command_options import MapOptions
-from sfm_shapefit.facts.joins import JoinOutcome
+from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.model import (
     Component,
     DatabaseInputs,
@@ -41,7 +41,7 @@ class JoinedModel(Written, Stated):
     reconstruction: "pycolmap.Reconstruction"
     models: tuple[int, ...]
     """Their numbers; the world is that of the first, scaled if known distances between them give a scale."""
-    joins: tuple[JoinOutcome, ...]
+    joins: tuple[JoinFacts, ...]
     """What came of joining each model to another, those included that are not in this one."""
     cameras: Table[CameraRow]
     """One row per image of these models."""
@@ -91,7 +91,7 @@ class MapResult(Written, Tabled):
     left_out: dict[str, str]
     """Name and reason of each image in no model."""
     timings_s: dict[str, float]
-    joins: tuple[JoinOutcome, ...] = ()
+    joins: tuple[JoinFacts, ...] = ()
     """What came of joining each model but the largest to a larger one."""
     joined: tuple[JoinedModel, ...] = ()
     """Models that were joined, in one world; each stands in `models` by itself too."""
@@ -147,7 +147,7 @@ class MapResult(Written, Tabled):
                 )
                 for number, model in enumerate(self.models)
             ],
-            joins=[join.facts(self.folder_of_join(join)) for join in self.joins],
+            joins=list(self.joins),
         )
 
     @property
@@ -179,10 +179,6 @@ class MapResult(Written, Tabled):
         """Names of all images of the models."""
         return tuple(name for model in self.models for name in model.image_names)
 
-    def folder_of_join(self, join: JoinOutcome) -> str | None:
-        """Return where the models of a join stand in one world; None if they were not joined."""
-        return next((one.folder for one in self.joined if join.join and join.model in one.models), None)
-
     def _repr_html_(self) -> str:
         """Return what matters of all models, and what the largest shows of itself."""
         return f"<p>{html.escape(self._headline())}</p>{self.models[0]._repr_html_()}"
@@ -199,9 +195,9 @@ def _averaging_of(model: LocateResult) -> AveragedRotations:
 
 
 def tell_joins(result: MapResult) -> MapResult:
-    """Return the result whose models know what came of joining them."""
-    models = list(result.models)
-    for join in result.joins:
-        facts, model = join.facts(result.folder_of_join(join)), models[join.model]
-        models[join.model] = replace(model, join=facts)
-    return replace(result, models=tuple(models))
+    """Return the result whose joins tell the folder of both models, and whose models what came of theirs."""
+    folders = {number: one.folder for one in result.joined for number in one.models}
+    joins = tuple(replace(one, folder=folders[one.number]) if one.joined else one for one in result.joins)
+    of_model = {one.number: one for one in joins}
+    models = (replace(one, join=of_model.get(number)) for number, one in enumerate(result.models))
+    return replace(result, joins=joins, models=tuple(models))

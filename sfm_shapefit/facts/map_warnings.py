@@ -10,6 +10,7 @@ from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.scene import describe_repeated_pairs, describe_rival_pairs
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.placement.gauge_options import KnownDistance
+from sfm_shapefit.scene.given import ScaleBars
 
 _ALARMING_SHARE = 0.7  # share of a model's agreeing pairs; below, warn (castle-P30: 0.97, lego100: 0.89)
 _DOUBTFUL_SHARE = 0.25  # share of an image's agreeing pairs; below, its averaged rotation is doubtful
@@ -42,6 +43,17 @@ def map_warnings(incomplete_rigs: Sequence[int], models: Sequence[LocateResult])
                 f"model {number}: most pairs of {counted(len(doubtful), 'image')} contradict their averaged "
                 f"rotations, above all those of {worst}"
             )
+
+
+def lost_bars(
+    known: ScaleBars | None, models: Sequence[LocateResult], joined: Sequence[JoinedModel]
+) -> Iterator[str]:
+    """Yield which scale bars no model shows."""
+    shown = {bar.name for model in models for bar in model.scale_bars}
+    shown |= {bar.name for one in joined for bar in one.facts.scale_bars}
+    for name, place in zip(known.bars, known.places, strict=True) if known else ():
+        if name not in shown:
+            yield f"{place}: {name} is of no use: no image of a model has a mark of it"
 
 
 def lost_distances(

@@ -20,6 +20,7 @@ from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics, describe_intrinsics
 from sfm_shapefit.facts.joins import JoinFacts
+from sfm_shapefit.facts.lengths import LengthFacts
 from sfm_shapefit.facts.placed import (
     IN_MEMORY,
     SCHEMA_VERSION,
@@ -32,6 +33,7 @@ from sfm_shapefit.facts.placed import (
     Warnings,
 )
 from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
+from sfm_shapefit.facts.scale_bars import ScaleBar, describe_scale_bars
 from sfm_shapefit.facts.scene import DistanceFacts, describe_line, describe_loops
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -173,7 +175,7 @@ class FactsOfModel(Facts):
         contradict = (
             f"{against[0]:,} of {counted(against[1], 'pair')} contradict{'s' * (against[1] == 1)} the result"
         )
-        contradict = contradict if against[1] else "no pair says where cameras stand"
+        contradict = contradict if against[1] else "no pair determines where cameras are"
         silent = self.num_pairs - against[1]
         if silent > against[1] > 0:
             contradict += f", and {silent:,} of {self.num_pairs:,} pairs say nothing of it"
@@ -203,8 +205,8 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
     scale_sigma: Annotated[
         float | None,
-        "Relative standard deviation of a scale that comes from rigs, priors, known distances or control "
-        "points; else null.",
+        "Relative standard deviation of a scale that comes from rigs, priors, known distances, scale bars or "
+        "control points; else null.",
     ]
     known_distances: Annotated[
         tuple[DistanceFacts, ...], "Distances that the user gave, and those in the model."
@@ -213,12 +215,16 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         dict[str, float], "Images whose position priors are wrong, most likely, and how far these are off."
     ]
     control_points: Annotated[tuple[ControlPoint, ...], "Ground control points, with their residuals."]
+    scale_bars: Annotated[tuple[ScaleBar, ...], "Known lengths between points, and those in the model."]
     datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
     rigid_groups: Annotated[GroupFacts | None, "Null where every camera moves by itself."]
     intrinsics: Annotated[
         tuple[CameraIntrinsics, ...], "Cameras that were never calibrated, or were asked to be refined."
     ]
     refined_rigs: Annotated[tuple[RefinedSensor, ...], "Sensors whose poses in their rigs were refined."]
+    lengths: Annotated[
+        LengthFacts | None, "How well a length between its points is known; null where that is not known."
+    ]
     line_sigma: Annotated[
         float | None,
         "Median standard deviation of a position along the line on which all cameras stand, as a share of "
@@ -252,6 +258,8 @@ class ModelFacts(FactsOfModel, PlacedFacts):
             Row("intrinsics", describe_intrinsics(self.intrinsics)),
             Row("rigs", describe_rigs(self.refined_rigs)),
             row("control points", describe_control_points(self.control_points)),
+            row("scale bars", describe_scale_bars(self.scale_bars)),
+            row("lengths", self.lengths.statement if self.lengths and self.lengths.has_scale else ""),
             row("straight", describe_line(self.line_sigma)),
             row("numbered images", describe_loops(self.loops)),
         ]
@@ -265,6 +273,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         """Return what the terminal says; `left_out` has images and why, `centers` where centers come from."""
         rows = [
             Row("not placed", left_out),
+            row("not trusted", _how_to_keep(len(self.not_trusted))),
             *self.piece_rows(),
             *self.scene_rows(),
             Row("warning", self.warnings),
@@ -294,6 +303,16 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         contradicting, usable = counts.pop("outlier"), counts.pop("usable")
         others = [f"{count}: {DirectionStatus[status.upper()].value}" for status, count in counts.items()]
         return [f"{usable}: usable ({contradicting} contradict the solution)", *others]
+
+
+def _how_to_keep(num_not_trusted: int) -> str:
+    """Say how to keep images that are left out; empty if there are none."""
+    count = counted(num_not_trusted, "image")
+    return (
+        f"{count} of these; min_trust=0 keeps {'them' if num_not_trusted > 1 else 'it'}"
+        if num_not_trusted
+        else ""
+    )
 
 
 def next_of_model(grade: Grade, facts: FactsOfModel) -> NextStep:
@@ -326,6 +345,7 @@ class CheckedFacts(FactsOfModel):
         float | None, "Median number of images that see a 3D point; null if there are none."
     ]
     num_lenses: Annotated[int, "Cameras in COLMAP's sense: lenses of the images with a pose."]
+    scale_bars: Annotated[tuple[ScaleBar, ...], "Known lengths between points, and those in the model."] = ()
     second_opinion: Annotated[str | None, "Folder that has the models of the second opinion, if any."] = None
     images: Annotated[str | None, "Folder of the pictures that were matched for this, if any."] = None
 
@@ -394,7 +414,8 @@ class CheckedFacts(FactsOfModel):
         lines = self.told_lines((int(np.sum(contradicting(pairs) & judged)), int(judged.sum())))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
         notes = Row("warning", [one for one in self.warnings if one not in self.evidence.statements])
-        rows = [Row("weak", weak), row("without a pose", absent), second, notes]
+        bars = row("scale bars", describe_scale_bars(self.scale_bars))
+        rows = [Row("weak", weak), row("without a pose", absent), second, bars, notes]
         return Telling(lines, rows, elsewhere="see the report", step=self.next_step)
 
 

@@ -36,6 +36,7 @@ UNITS = {
     "prior": "of the priors' units",
     "fixed": "of the fixed cameras' units",
     "control points": "of the control points' units",
+    "scale bars": "of the scale bars' units",
 }
 """Unit of a standard deviation, by the choice of the scale."""
 SOLVER_UNITS = "of the solver's units"
@@ -64,7 +65,8 @@ class KeyFigures(Record):
     """The figures that terminal and report begin with, beside the number of placed cameras."""
 
     pair_error_deg: Annotated[
-        float | None, "Median angle between the direction of a pair and the line between its cameras."
+        float | None,
+        "Median angle between the direction of a pair that agrees and the line between its cameras.",
     ]
     pair_error_px: Annotated[
         float | None, "The same in pixels, at the images' median focal length; null for a bare graph."
@@ -353,7 +355,7 @@ def facts_of_placement(
     return {
         "num_images": graph.num_nodes,
         "num_placed": len(placement.cameras),
-        "figures": KeyFigures.of_cameras(cameras, residuals["quantile_50"], *measures),
+        "figures": KeyFigures.of_cameras(cameras, pair_error_deg(placement), *measures),
         "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
         "sigma_of": sigma_of(placement),
@@ -380,6 +382,13 @@ def sigma_of(placement: Judged) -> str:
     held = ~placement.adjusted_covariances.any(axis=(1, 2))
     relative = f"{int(held.sum())} fixed cameras" if held.any() else "the model's mean position and scale"
     return f"adjusted: noise, rotations, calibration; relative to {relative}"
+
+
+def pair_error_deg(placement: Judged) -> float | None:
+    """Return the median residual in degrees of the placed pairs that agree; None if none does."""
+    agree = placement.assessment.inliers[placement.pairs]
+    residuals = placement.assessment.residuals_deg[placement.pairs][agree]
+    return float(np.median(residuals)) if len(residuals) else None
 
 
 def residuals_deg(placement: Judged) -> dict[str, float]:

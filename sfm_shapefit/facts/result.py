@@ -18,6 +18,7 @@ from sfm_shapefit.facts.command_options import PlacingOptions
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.joins import JoinFacts
+from sfm_shapefit.facts.lengths import LengthFacts
 from sfm_shapefit.facts.model import (
     GroupFacts,
     ModelFacts,
@@ -38,6 +39,7 @@ from sfm_shapefit.facts.placed import (
 from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
+from sfm_shapefit.facts.scale_bars import ScaleBar
 from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, Tabled
 from sfm_shapefit.facts.warnings import match_warnings
@@ -161,7 +163,16 @@ class LocateResult(_Placed):
 
     _PUBLIC = (
         *("reconstruction", "cameras", "pairs", "table", "warnings", "database", "options", "timings_s"),
-        *("gauge", "intrinsics", "rigs", "control_points", "further", "certified", "adjustment"),
+        *(
+            "gauge",
+            "intrinsics",
+            "rigs",
+            "control_points",
+            "scale_bars",
+            "further",
+            "certified",
+            "adjustment",
+        ),
     )
     seed: ModelInArrays
     """The output, as `reconstruction` and `write` have it."""
@@ -225,6 +236,10 @@ class LocateResult(_Placed):
     """The sensors that were refined in their rigs."""
     control_points: tuple[ControlPoint, ...] = ()
     """Ground control points with their residuals, where some are given."""
+    scale_bars: tuple[ScaleBar, ...] = ()
+    """Scale bars as they are in the model, where some are given."""
+    lengths: LengthFacts | None = None
+    """How well a length between its points is known; None where that is not known."""
     suspicions: tuple[Reason, ...] = ()
     """What else speaks against the model: steps that failed, rotations that were far off, and what the
     averaging of rotations saw."""

@@ -10,6 +10,7 @@ from typing import Any
 from sfm_shapefit.base.record import schema_of
 from sfm_shapefit.facts.checked_pieces import CheckedPieces
 from sfm_shapefit.facts.inspected import Inspection
+from sfm_shapefit.facts.lengths import LengthsFacts
 from sfm_shapefit.facts.model import CheckedFacts, JoinedFacts, MapFacts, ModelFacts
 from sfm_shapefit.facts.placed import GraphFacts
 from sfm_shapefit.scene.evaluation import EvaluationFacts, PositionFacts
@@ -22,6 +23,7 @@ _COMMANDS = {
     "inspect": Inspection,
     "evaluate": EvaluationFacts,
     "evaluate_table": PositionFacts,
+    "evaluate_lengths": LengthsFacts,
     "check": CheckedFacts,
     "check_pieces": CheckedPieces,
     "map": MapFacts,
@@ -39,8 +41,9 @@ def output_schema() -> dict[str, Any]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Output of sfm-shapefit",
         "description": "Each command prints one object with --json. $defs has the schema of each: locate, "
-        "solve_graph (the command place), inspect, evaluate (against a table: evaluate_table), check (of "
-        "several models: check_pieces), map. joined is the locate.json of models that map has joined.",
+        "solve_graph (the command place), inspect, evaluate (against a table: evaluate_table; of a model "
+        "alone: evaluate_lengths), check (of several models: check_pieces), map. joined is the locate.json "
+        "of models that map has joined.",
         "anyOf": [{"$ref": f"#/$defs/{name}"} for name in _COMMANDS],
         "$defs": definitions,
     }

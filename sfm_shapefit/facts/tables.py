@@ -9,7 +9,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TextIO, TypeVar, cast, get_args, overload
@@ -218,14 +218,26 @@ def read_trust(path: Path) -> dict[str, float]:
 
 def model_datum(model: Any) -> EarthDatum | None:
     """Return the datum of a result, or that in locate.json beside a model; None without."""
+    datum: EarthDatum | None = told_of(model, "datum", lambda found: EarthDatum(**found))
+    return datum
+
+
+def model_scale_sigma(model: Any) -> float | None:
+    """Return the relative standard deviation of the scale of a result or model, likewise."""
+    sigma: float | None = told_of(model, "scale_sigma", float)
+    return sigma
+
+
+def told_of(model: Any, name: str, read: Callable[[Any], Any]) -> Any:
+    """Return a figure of a result, or that in locate.json beside a model, read as it stands there."""
     if not isinstance(model, Path | str):
-        return getattr(getattr(model, "facts", None), "datum", None)
+        return getattr(getattr(model, "facts", None), name, None)
     file = Path(model) / MARKER
     if not file.is_file():
         return None
     try:
-        found = json.loads(text_of(file)).get("datum")
-        return None if found is None else EarthDatum(**found)
+        found = json.loads(text_of(file)).get(name)
+        return None if found is None else read(found)
     except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{file} cannot be read; run locate again, or remove it") from error
 

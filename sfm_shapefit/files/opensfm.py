@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.files.json_node import JsonNode, read_json
 from sfm_shapefit.files.lines import text_of
@@ -82,7 +83,7 @@ def read_opensfm(file: Path) -> OpenSfmModel:
     known, lengths = np.unique(observed[:, 0], return_counts=True)
     points = Points(
         xyz=np.reshape(xyz, (-1, 3))[known],
-        offsets=np.append(0, np.cumsum(lengths)),
+        offsets=offsets_of(lengths),
         images=observed[order, 1],
         keypoints=(np.arange(len(observed)) - bounds[observed[:, 1]])[order],
         ids=known + 1,

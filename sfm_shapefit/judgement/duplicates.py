@@ -47,7 +47,7 @@ def find_split_duplicates(
     split, most = is_among(pairs, found), np.zeros_like(most)
     np.maximum.at(most, pairs[split], apart[split, None])
     if len(named := np.flatnonzero(most)):
-        sentence = "a near duplicate that stands {} times the distance to its points away"
+        sentence = "a near duplicate that is {} times the distance to its points away"
         yield OddImages.of_values(Kind.PLACE, images.names_of(named), most[named], sentence)
 
 
@@ -76,7 +76,7 @@ def _find_duplicates(
 
 def _places(images: Images, pictures: KeypointRays, batch: KeypointMatches, side: int) -> FloatArray:
     """Return where the matches of pairs are in their first or second image, (M, 2), in its widths."""
-    image_of = np.repeat(batch.pairs[:, side], np.diff(batch.offsets))
+    image_of = batch.spread(batch.pairs[:, side])
     order, (present, counts) = np.argsort(image_of, kind="stable"), np.unique(image_of, return_counts=True)
     places = np.empty((len(image_of), 2))
     for image, rows in zip(present.tolist(), np.split(order, np.cumsum(counts)[:-1]), strict=True):

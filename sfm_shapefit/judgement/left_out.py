@@ -25,6 +25,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.base.losses import CAUCHY, weighed
 from sfm_shapefit.judgement.limits import FEWEST_POINTS, FITTING_PX
 from sfm_shapefit.pairs.kernels import fill_basis, median
@@ -97,11 +98,11 @@ def leave_one_out(
         seen = np.bincount(points.points_seen(), asked[points.images], points.num_points) > 0.0
         points = points.taken(seen[points.points_seen()])
     points, rays, on_plane = _look(points, images, pictures)
-    order = np.argsort(points.images, kind="stable")
-    begins = np.searchsorted(points.images[order], np.arange(n + 1))
+    of_images = RowLists.by_label(points.images, n)
     given = (
-        points.xyz, points.offsets, points.images, points.points_seen(), rays, on_plane, order, begins,
-        images.rotations, images.centers, images.focal_lengths_px, images.are_angular, believed,
+        points.xyz, points.offsets, points.images, points.points_seen(), rays, on_plane, of_images.rows,
+        of_images.offsets, images.rotations, images.centers, images.focal_lengths_px, images.are_angular,
+        believed,
     )  # fmt: skip
     counts, figures = np.zeros(n, dtype=np.int64), np.full((n, 4), np.nan)
     arrays = *(frozen(np.ascontiguousarray(array)) for array in given), counts, figures

@@ -24,6 +24,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
+from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.bodies import find_bodies
@@ -132,13 +133,10 @@ def _moved(bodies: IntArray, pairs: IntArray, weights: FloatArray) -> IntArray:
     """Return the bodies (n,) after moves of single cameras to where their pairs agree most."""
     bodies, count = bodies.copy(), len(bodies)
     ends, others = pairs.T.ravel(), pairs[:, ::-1].T.ravel()
-    order = np.argsort(ends, kind="stable")
-    begins = np.searchsorted(ends[order], np.arange(count + 1))
-    others, doubled = others[order], np.tile(weights, 2)[order]
+    doubled, ends_of = np.tile(weights, 2), list(RowLists.by_label(ends, count))
     for _ in range(_MOST_ROUNDS):
         moved = False
-        for camera in range(count):
-            own = slice(begins[camera], begins[camera + 1])
+        for camera, own in enumerate(ends_of):
             gains = np.bincount(bodies[others[own]], doubled[own], count)
             best = int(np.argmax(gains))
             if gains[best] > gains[bodies[camera]]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, CHECKED_BY, FEWEST_POINTS, OUTNUMBERED, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images
@@ -106,7 +107,7 @@ class PartnerCounts:
         self._posed = images.is_posed
         self._free = np.ones_like(self._posed) if fixed is None else ~fixed
         self._sizes = np.where(self._posed, num_keypoints, 0)
-        self._begins = np.append(0, np.cumsum(self._sizes))
+        self._begins = offsets_of(self._sizes)
         self._counts = np.zeros((self._begins[-1], 2), dtype=np.int32)
 
     def anew(self, images: Images) -> "PartnerCounts":

@@ -45,6 +45,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
 from sfm_shapefit.base.geometry import nearest_rotations, rotation_angles_deg
+from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.limits import (
@@ -206,7 +207,7 @@ def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
     inflation = max(1.0, _level(case))
     case = case._replace(sigmas_rad=case.sigmas_rad * inflation)
     least_rad = _LEAST_TURN_RAD * max(1.0, inflation / 2.0)
-    touching, verdicts = _Touching.of(case.pairs, count), _Verdicts(count)
+    touching, verdicts = RowLists.by_label(case.pairs.ravel(), count), _Verdicts(count)
     case, done = _turn_bodies(case, touching, verdicts, least_rad)
     _judge_as_placed(case, touching, done, verdicts, least_rad)
     return verdicts.of_cameras(labels)
@@ -265,23 +266,9 @@ class _Verdicts:
         )
 
 
-class _Touching(NamedTuple):
-    """The pairs that each of the groups has a part in."""
-
-    starts: IntArray
-    """(count + 1,) the pairs of group g are rows[starts[g]:starts[g + 1]]."""
-    rows: IntArray
-
-    @classmethod
-    def of(cls, pairs: IntArray, count: int) -> "_Touching":
-        """Return those of pairs (k, 2) of groups."""
-        ends = pairs.ravel()
-        starts = np.append(0, np.cumsum(np.bincount(ends, minlength=count)))
-        return cls(starts, np.argsort(ends, kind="stable") // 2)
-
-    def rows_of(self, members: IntArray) -> IntArray:
-        """Return the pairs that some groups have a part in, ascending."""
-        return np.unique(np.concatenate([self.rows[self.starts[g] : self.starts[g + 1]] for g in members]))
+def _pairs_of(members: IntArray, touching: RowLists) -> IntArray:
+    """Return the pairs that some groups have a part in, ascending; `touching` has the ends of each group."""
+    return np.unique(touching.subset(members).rows // 2)
 
 
 def _angles(rotations: FloatArray) -> FloatArray:
@@ -312,7 +299,7 @@ def _find_bodies(pairs: PairTurns, count: int) -> IntArray:
 
 
 def _turn_bodies(
-    case: PairTurns, touching: _Touching, verdicts: _Verdicts, least_rad: float
+    case: PairTurns, touching: RowLists, verdicts: _Verdicts, least_rad: float
 ) -> tuple[PairTurns, BoolArray]:
     """Turn one body after the other, the worst first; return the pairs as mended, and which groups turned."""
     count = len(verdicts.judged)
@@ -329,7 +316,7 @@ def _turn_bodies(
 
 
 def _judge_as_placed(
-    case: PairTurns, touching: _Touching, done: BoolArray, verdicts: _Verdicts, least_rad: float
+    case: PairTurns, touching: RowLists, done: BoolArray, verdicts: _Verdicts, least_rad: float
 ) -> None:
     """Judge the groups that were not turned: those of the largest body alone, others with their bodies."""
     bodies = _find_bodies(case, len(done))
@@ -341,12 +328,12 @@ def _judge_as_placed(
                 continue
             part = np.zeros_like(done)
             part[members] = True
-            own = rows_taken(case, touching.rows_of(members))
+            own = rows_taken(case, _pairs_of(members, touching))
             verdicts.note(members, _judge(own, part, largest & ~part, least_rad))
 
 
 def _worst_body(
-    pairs: PairTurns, touching: _Touching, bodies: IntArray, done: BoolArray, least_rad: float
+    pairs: PairTurns, touching: RowLists, bodies: IntArray, done: BoolArray, least_rad: float
 ) -> tuple[BoolArray, _Judged] | None:
     """Return the body whose turn mends most, the smallest of equals, and what is said of it."""
     candidates = []
@@ -354,7 +341,7 @@ def _worst_body(
         body = (bodies == label) & ~done
         if not body.any() or 2 * body.sum() > len(body):
             continue
-        own = rows_taken(pairs, touching.rows_of(np.flatnonzero(body)))
+        own = rows_taken(pairs, _pairs_of(np.flatnonzero(body), touching))
         judged = _judge(own, body, ~body, least_rad)
         if judged.kind is Doubt.TURNED:
             candidates.append((body, judged))

@@ -8,9 +8,10 @@ solution"). For each supernode, children first:
     update     U = -L_RJ L_RJ^T + what the children leave for later fronts, kept on a stack
 
 What depends on the graph alone is planned once (`analyze`); `refactor` takes new edge weights and does not
-sort. Disjoint subtrees are tasks for several threads, in the factorization and in both substitutions; the
-large fronts above them are factored by strips of columns. Tasks and strips are the same for any number of
-threads, and so is every bit of the answer.
+sort. Disjoint subtrees are tasks for several threads, in the factorization and in both substitutions. A front
+above them is another task of the factorization, as soon as its children are done, and the large ones, which
+come last, are factored by strips of columns. What is summed, and in which order, depends on the graph alone,
+and so does every bit of the answer.
 
 A Laplacian is singular: constants are its null space. The mean weight is added to the last pivot instead of
 removing a row. For right-hand sides orthogonal to the constants the answer is exact, the one that is 0 at
@@ -23,25 +24,24 @@ ratio, `smallest_pivot`, is of the order of the rounding unit where the graph is
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from queue import SimpleQueue
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import array_address, inner_kernel, kernel, multiply_in_lanes
 from sfm_shapefit.laplacian.dense import PIVOT_TOLERANCE, Blas, Block, blas_of, gemm, potrf, syrk, trsm
+from sfm_shapefit.laplacian.front_memory import FrontMemory
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
-_LARGE_FRONT, _STRIP = (
-    768,
-    256,
-)  # rows of a front above the tasks, and columns of its strips; threads share it
+_LARGE_FRONT = 768  # rows of a front above the tasks; smaller ones give threads too little to share
+_STRIP = 256  # columns; of fewer, products are slower
 
 # What is done with a front, one after the other.
 _ASSEMBLE, _FACTOR, _PASS_ON = range(3)
@@ -167,7 +167,7 @@ class CholeskyFactor:
 
     def selected_inverse(self, edges: IntArray) -> SelectedInverse:
         """Return the blocks of the inverse at nodes and edges; see `laplacian.selected`."""
-        return selected_inverse(self.plan, self.block, self.panels, edges)
+        return selected_inverse(self.plan, (self.block, self.panels), edges, self.workers)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with L x = rhs, with x = 0 at the grounded node, in float64.
@@ -193,82 +193,78 @@ class CholeskyFactor:
 
 def _factor_all(factor: CholeskyFactor, given: _Input) -> tuple[bool, FloatArray]:
     """Factor all supernodes; return whether a pivot was not positive, and the least pivot and its row."""
-    plan = factor.plan
-    arenas = min(factor.workers.threads, len(plan.tasks))
-    size = (plan.stack_size + arenas * plan.arena_size) * factor.block**2
-    stack = np.empty(size, dtype=factor.dtype)  # update matrices that wait for their parents, then the arenas
-    free = SimpleQueue[int]()
-    for k in range(arenas):
-        free.put(plan.stack_size + k * plan.arena_size)
-    pivots = np.full((len(plan.tasks) + 1, 2), np.inf)
-    failed = np.zeros(len(pivots), np.bool_)
+    plan, workers = factor.plan, factor.workers
+    memory = FrontMemory(plan, workers.threads)
+    units, given = memory.units, given._replace(update_offsets=memory.offsets)
+    stack = np.empty(memory.size * factor.block**2, dtype=factor.dtype)  # holds update matrices
+    pivots, failed = np.full((len(units), 2), np.inf), np.zeros(len(units), np.bool_)
+    is_large, is_shared = _find_large(factor)
 
-    def task(k: int) -> Callable[[], object]:
-        def run() -> None:
-            begin, end = plan.tasks[k]
-            arena = free.get()
-            try:
-                failed[k] = _factorize(
-                    begin,
-                    end,
-                    _ASSEMBLE,
-                    _PASS_ON,
-                    given,
-                    factor.panels,
-                    stack,
-                    arena,
-                    pivots[k],
-                    blas_of(factor.dtype),
-                )
-            finally:
-                free.put(arena)
+    def factor_unit(unit: int) -> None:
+        run, below = units[unit], list(plan.needs[unit])
+        if failed[below].any():
+            failed[unit] = True
+            return
+        with memory.room(unit, memory.leaving(unit), memory.entering(unit)):
+            failed[unit] = _factor_unit(factor, given, stack, run, is_large, pivots[unit])
 
-        return run
-
-    done = 0
-    for begin, end in [*plan.above.tolist(), [plan.num_supernodes] * 2]:
-        ready = int(np.searchsorted(plan.tasks[:, 0], begin))
-        factor.workers.run([task(k) for k in range(done, ready)])
-        done = ready
-        failed[-1] = failed.any() or _factor_above(factor, given, stack, begin, end, pivots[-1])
-        if failed[-1]:
-            break
+    is_shared &= memory.num_arenas > 1
+    own, shared = np.flatnonzero(~is_shared).tolist(), np.flatnonzero(is_shared).tolist()
+    place = np.cumsum(~is_shared) - 1
+    needs = [place[list(plan.needs[unit])].tolist() for unit in own]
+    workers.run_after([partial(factor_unit, unit) for unit in own], needs)
+    for unit in shared:
+        factor_unit(unit)
     return bool(failed.any()), pivots[np.argmin(pivots[:, 0])]
 
 
-def _factor_above(
-    factor: CholeskyFactor, given: _Input, stack: npt.NDArray[Any], begin: int, end: int, pivot: Any
-) -> bool:
-    """Factor a run of supernodes above the tasks: the large ones by strips, the others as in a task."""
+def _find_large(factor: CholeskyFactor) -> tuple[BoolArray, BoolArray]:
+    """Return which fronts are factored by strips (S,), and which units wait for such a one or have it (U,).
+
+    Threads share the strips, once they have done all other units.
+    """
     plan = factor.plan
+    is_large = (np.diff(plan.first) + np.diff(plan.row_pointers)) * factor.block >= _LARGE_FRONT
+    for begin, end in plan.tasks:
+        is_large[begin:end] = False
+    is_shared = np.zeros(len(plan.needs), np.bool_)
+    is_shared[plan.unit_of[is_large]] = True
+    for unit, below in enumerate(plan.needs):
+        is_shared[unit] |= is_shared[list(below)].any()
+    return is_large, is_shared
+
+
+def _factor_unit(
+    factor: CholeskyFactor, given: _Input, stack: npt.NDArray[Any], unit: IntArray, is_large: BoolArray,
+    pivot: Any,
+) -> bool:  # fmt: skip
+    """Factor the supernodes of a unit, the large ones by strips; return whether a pivot was not positive."""
 
     def run(first: int, last: int, from_step: int, to_step: int) -> bool:
         blas = blas_of(factor.dtype)
-        return _factorize(first, last, from_step, to_step, given, factor.panels, stack, 0, pivot, blas)
+        return _factorize(first, last, from_step, to_step, given, factor.panels, stack, pivot, blas)
 
-    heights = np.diff(plan.first)[begin:end] + np.diff(plan.row_pointers)[begin:end]
-    large = np.flatnonzero(heights * factor.block >= _LARGE_FRONT) + begin
-    at = begin
-    for s in [*large.tolist(), end]:
+    at, end = unit.tolist()
+    for s in [*(np.flatnonzero(is_large[at:end]) + at).tolist(), end]:
         if at < s and run(at, s, _ASSEMBLE, _PASS_ON):
             return True
         if s < end:
             run(s, s + 1, _ASSEMBLE, _ASSEMBLE)
-            if _factor_large(factor, stack, s, pivot):
+            if _factor_large(factor, given, stack, s, pivot):
                 return True
             run(s, s + 1, _PASS_ON, _PASS_ON)
         at = s + 1
     return False
 
 
-def _factor_large(factor: CholeskyFactor, stack: npt.NDArray[Any], s: int, pivot: Any) -> bool:
+def _factor_large(factor: CholeskyFactor, given: _Input, stack: npt.NDArray[Any], s: int, pivot: Any) -> bool:
     """Factor one assembled front by strips of columns, and write its update, in parallel jobs."""
     plan, b, workers, dtype = factor.plan, factor.block, factor.workers, factor.dtype
     width = int(plan.first[s + 1] - plan.first[s]) * b
     height = width + int(plan.row_pointers[s + 1] - plan.row_pointers[s]) * b
     below, size = height - width, factor.panels.itemsize
     panel = factor.panels.ctypes.data + int(plan.panel_pointers[s]) * b * b * size
-    update = stack.ctypes.data + int(plan.update_offsets[s]) * b * b * size
+    update = stack.ctypes.data + int(given.update_offsets[s]) * b * b * size
     info = factor_by_strips((panel, height), width, dtype, workers)
     if info != 0:
         pivot[:] = 0.0, plan.first[s] * b + info - 1
@@ -362,13 +358,12 @@ def _sum_at_nodes(given: Any) -> None:
 
 @kernel
 def _factorize(
-    begin: int, end: int, from_step: int, to_step: int, given: Any, panels: Any, stack: Any, arena: int,
-    pivot: Any, blas: Any,
+    begin: int, end: int, from_step: int, to_step: int, given: Any, panels: Any, stack: Any, pivot: Any,
+    blas: Any,
 ) -> bool:  # fmt: skip
     """Take the supernodes begin..end-1 through some steps; return True if a pivot was not positive.
 
-    A task has its updates in its arena, all but the root's; above the tasks, `arena` is 0. `pivot` is lowered
-    to the least ratio of a squared pivot to its diagonal entry and the row it stands in.
+    `pivot` is lowered to the least ratio of a squared pivot to its diagonal entry and the row it stands in.
     """
     b, first, row_pointers, diagonal = given.b, given.first, given.row_pointers, given.diagonal
     index, row, column, weights = given.edge_index, given.edge_row, given.edge_column, given.weights
@@ -379,7 +374,7 @@ def _factorize(
         height = width + below
         offset = given.panel_pointers[s] * b * b
         panel = panels[offset : offset + width * height]
-        update = (given.update_offsets[s] + (arena if s < end - 1 else 0)) * b * b
+        update = given.update_offsets[s] * b * b
         for step in range(from_step, to_step + 1):
             if step == _FACTOR:
                 square = array_address(panels) + offset * size, height
@@ -415,13 +410,13 @@ def _factorize(
                         pivot[1] = start + q
                 target, leading = stack[update : update + below * below], below
                 lowest, highest = width // b, height // b
-            _add_children(s, given, stack, arena, lowest, highest, target, leading)
+            _add_children(s, given, stack, lowest, highest, target, leading)
     return False
 
 
 @inner_kernel
 def _add_children(
-    s: int, given: Any, stack: Any, arena: int, lowest: int, highest: int, target: Any, leading: int
+    s: int, given: Any, stack: Any, lowest: int, highest: int, target: Any, leading: int
 ) -> None:
     """Add the columns of the children's updates that go to the columns lowest..highest-1 of a front.
 
@@ -442,7 +437,7 @@ def _add_children(
             if there[j] < lowest or there[j] >= highest:
                 continue
             for c in range(b):
-                source = (given.update_offsets[child] + arena) * b * b + (j * b + c) * size * b
+                source = given.update_offsets[child] * b * b + (j * b + c) * size * b
                 into = ((there[j] - lowest) * b + c) * leading
                 i = j
                 skip = c  # the part of the diagonal block above the diagonal was never written

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
@@ -127,14 +128,62 @@ class Workers:
                 except BaseException as failure:
                     failures[k] = failure
 
-        helpers = [self._helpers.submit(work) for _ in range(min(self.threads, len(jobs)) - 1)]
+        self._with_helpers(work, len(jobs))
+        if failures:
+            raise failures[min(failures)]
+
+    def run_after(self, jobs: Sequence[Callable[[], object]], needs: Sequence[Sequence[int]]) -> None:
+        """Run all jobs, each as soon as those before it that it needs have ended; else as `run`.
+
+        Args:
+            jobs: see `run`.
+            needs: for each job the numbers of others, all less than its own.
+        """
+        if self._helpers is None or len(jobs) == 1:
+            self.run(jobs)
+            return
+        waits, followers = [len(numbers) for numbers in needs], [list[int]() for _ in jobs]
+        for k, numbers in enumerate(needs):
+            for number in numbers:
+                followers[number].append(k)
+        ready = [k for k, count in enumerate(waits) if not count]
+        done, changed, failures = list[int](), threading.Condition(), dict[int, BaseException]()
+
+        def work() -> None:
+            k = len(jobs)  # an interrupt while a thread waits comes after all failures
+            try:
+                while True:
+                    with changed:
+                        changed.wait_for(lambda: ready or failures or len(done) == len(jobs))
+                        if failures or not ready:
+                            return
+                        k = heappop(ready)
+                    jobs[k]()
+                    with changed:
+                        done.append(k)
+                        for follower in followers[k]:
+                            waits[follower] -= 1
+                            if not waits[follower]:
+                                heappush(ready, follower)
+                        changed.notify_all()
+            except BaseException as failure:
+                with changed:
+                    failures[k] = failure
+                    changed.notify_all()
+
+        self._with_helpers(work, len(jobs))
+        if failures:
+            raise failures[min(failures)]
+
+    def _with_helpers(self, work: Callable[[], None], num_jobs: int) -> None:
+        """Work in the caller's thread and in helpers, no more than there are jobs."""
+        assert self._helpers is not None
+        helpers = [self._helpers.submit(work) for _ in range(min(self.threads, num_jobs) - 1)]
         try:
             work()
         finally:
             for helper in helpers:
                 helper.result()
-        if failures:
-            raise failures[min(failures)]
 
     def share(self, starts: IntArray, work: Callable[[int, int], object], least: int = 1) -> None:
         """Call `work(begin, end)` for ranges of rows, whose answers must not depend on how they are cut.
@@ -191,7 +240,8 @@ class LaplacianOperator:
 
     def reweigh(self, weights: FloatArray) -> None:
         """Take other weights, (m,), in place of those before."""
-        _write_entries(self.graph.edge_of, weights, self._entries)
+        rounded = weights.astype(np.float32, copy=False)
+        np.take(rounded, self.graph.edge_of, out=self._entries, mode="clip")
 
     def diagonal(self) -> FloatArray:
         """Return the weighted degree of each node, (n,)."""
@@ -210,12 +260,6 @@ class LaplacianOperator:
 
         self._workers.share(graph.pointers, work, _ENTRIES_WORTH_A_THREAD)
         return out
-
-
-@kernel
-def _write_entries(edge_of: Any, weights: Any, out: Any) -> None:
-    for p in range(len(out)):
-        out[p] = weights[edge_of[p]]
 
 
 @kernel

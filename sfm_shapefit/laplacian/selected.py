@@ -8,21 +8,23 @@ Z of A obeys, from the last supernode to the first,
 and Z_RR is part of what is known of the parent, because R lies in the rows of the parent's panel (Takahashi,
 Fagan, Chin 1973, "Formation of a sparse bus impedance matrix"; Erisman and Tinney 1975; in fronts: Amestoy et
 al. 2012, "On computing inverse entries of a sparse matrix in an out-of-core environment"). It costs about
-twice the factorization. The block Z_RR of a supernode waits where its update matrix lay during the
-factorization: it lives from the parent to the supernode, the same interval run backwards.
+twice the factorization. The block Z_RR of a supernode waits as its update matrix did during the
+factorization, from the parent to the supernode: the same interval run backwards, and the same units of work.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.jit import array_address, inner_kernel, kernel
-from sfm_shapefit.laplacian.dense import blas_of, gemm, trsm
+from sfm_shapefit.laplacian.dense import Blas, blas_of, gemm, trsm
+from sfm_shapefit.laplacian.front_memory import FrontMemory
+from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
 _STRIP = 64  # rows of a product; half of it is wanted, and smaller products are slower
@@ -48,38 +50,46 @@ def regauged(nodes: FloatArray, solve: _Solve, null: FloatArray, dual: FloatArra
 
 
 def selected_inverse(
-    plan: SymbolicFactor, b: int, panels: npt.NDArray[Any], edges: IntArray
+    plan: SymbolicFactor, factor: tuple[int, FloatArray], edges: IntArray, workers: Workers
 ) -> SelectedInverse:
     """Return the blocks of the inverse at the nodes and edges of the graph.
 
     Args:
-        plan, b, panels: a factor whose blocks are b x b.
+        plan: of the factor.
+        factor: b and the panels; its blocks are b x b.
         edges: (m, 2) those that it was planned for, which say how each block is to be turned.
+        workers: the threads.
 
     Raises:
         ValueError: if it is not float64, or the edges are not as many.
     """
+    b, panels = factor
     if panels.dtype != np.float64 or len(edges) != plan.num_edges:
         raise ValueError("selected_inverse takes a float64 factor and the edges it was planned for")
     nodes, blocks = np.empty((plan.num_nodes, b, b)), np.empty((plan.num_edges, b, b))
-    places = plan.update_offsets.copy()
-    for begin, end in plan.tasks.tolist():
-        places[begin : end - 1] += plan.stack_size  # one task at a time has the arena
+    rooms = FrontMemory(plan, workers.threads)
     widths, below = np.diff(plan.first) * b, np.diff(plan.row_pointers) * b
     areas = widths * widths, widths * widths, widths * below, widths * below
-    memory = _Memory(
-        waiting=np.empty((plan.stack_size + plan.arena_size) * b * b),
-        work=np.empty(int(sum(np.max(area, initial=0) for area in areas))),
-        starts=np.cumsum([0, *(np.max(area, initial=0) for area in areas[:-1])]),
-        places=places * b * b,
-    )
+    starts = np.cumsum([0, *(np.max(area, initial=0) for area in areas)])
+    waiting, work = np.empty(rooms.size * b * b), np.empty((rooms.num_arenas, int(starts[-1])))
     plan_arrays = _Plan(
         b, plan.first, plan.row_pointers, plan.panel_pointers, plan.relative, plan.child_pointers,
         plan.children, plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
         plan.permutation,
     )  # fmt: skip
+
+    def invert(unit: int) -> None:
+        with rooms.room(unit, rooms.entering(unit), rooms.leaving(unit)) as arena:
+            memory = _Memory(waiting, work[arena], starts[:-1], rooms.offsets, blas_of(panels.dtype))
+            _invert(rooms.units[unit], plan_arrays, panels, memory, nodes, blocks)
+
+    last = len(rooms.units) - 1
+    needs = [list[int]() for _ in rooms.units]  # from the last unit to the first, now the parents of each
+    for unit, children in enumerate(plan.needs):
+        for child in children:
+            needs[last - child].append(last - unit)
     with one_blas_thread():
-        _invert(plan_arrays, panels, memory, blas_of(panels.dtype), nodes, blocks)
+        workers.run_after([partial(invert, last - k) for k in range(last + 1)], needs)
     reversed_edges = plan.inverse[edges[:, 0]] < plan.inverse[edges[:, 1]]  # stored: (later, earlier)
     blocks[reversed_edges] = blocks[reversed_edges].transpose(0, 2, 1)
     return SelectedInverse(nodes=nodes, edges=blocks)
@@ -106,19 +116,20 @@ class _Memory(NamedTuple):
     waiting: FloatArray  # -Z_RR of each supernode, from when its parent is done until it is done itself
     work: FloatArray  # L_JJ^-T, -Z_JJ, -Y^T, Z_JR of one supernode
     starts: IntArray  # (4,) where these are in `work`
-    places: IntArray  # (S,) where each supernode's block is in `waiting`
+    places: IntArray  # (S,) where each supernode's block is in `waiting`, in blocks of b x b
+    blas: Blas
 
 
 @kernel
-def _invert(plan: Any, panels: Any, memory: Any, blas: Any, nodes: Any, blocks: Any) -> None:
-    """Write the inverse's blocks of the nodes (n, b, b) and edges (m, b, b), the later node of an edge first.
+def _invert(run: Any, plan: Any, panels: Any, memory: Any, nodes: Any, blocks: Any) -> None:
+    """Write the inverse's blocks of the nodes (n, b, b) and edges (m, b, b) of a run of supernodes.
 
-    BLAS subtracts products here, hence the signs of what is kept.
+    The later node of an edge comes first. BLAS subtracts products here, hence the signs of what is kept.
     """
-    b, first, row_pointers, work = plan.b, plan.first, plan.row_pointers, memory.work
+    b, first, row_pointers, work, blas = plan.b, plan.first, plan.row_pointers, memory.work, memory.blas
     root_at, own_at, y_at, cross_at = memory.starts
     size, base = work.itemsize, array_address(work)
-    for s in range(len(first) - 2, -1, -1):
+    for s in range(run[1] - 1, run[0] - 1, -1):
         width = (first[s + 1] - first[s]) * b
         below = (row_pointers[s + 1] - row_pointers[s]) * b
         panel = array_address(panels) + plan.panel_pointers[s] * b * b * size
@@ -129,7 +140,7 @@ def _invert(plan: Any, panels: Any, memory: Any, blas: Any, nodes: Any, blocks: 
             base + y_at * size,
             base + cross_at * size,
         )
-        rest = array_address(memory.waiting) + memory.places[s] * size, most
+        rest = array_address(memory.waiting) + memory.places[s] * b * b * size, most
         for k in range(width * width):
             work[root_at + k] = 0.0
         for k in range(width):
@@ -163,11 +174,11 @@ def _invert(plan: Any, panels: Any, memory: Any, blas: Any, nodes: Any, blocks: 
 def _hand_to_children(s: int, plan: Any, memory: Any, inverse: Any, width: int, below: int) -> None:
     """Copy to each child's place what it needs of its parent's inverse, one triangle and its mirror image."""
     b, waiting, (own, cross) = plan.b, memory.waiting, inverse
-    rest = memory.places[s]
+    rest = memory.places[s] * b * b
     for q in range(plan.child_pointers[s], plan.child_pointers[s + 1]):
         child = plan.children[q]
         begin, count = plan.row_pointers[child], plan.row_pointers[child + 1] - plan.row_pointers[child]
-        start, side = memory.places[child], count * b
+        start, side = memory.places[child] * b * b, count * b
         for i in range(count):
             row = np.int64(plan.relative[begin + i]) * b
             for j in range(i + 1):

@@ -87,15 +87,19 @@ class SymbolicFactor:
     tasks: IntArray
     """(K, 2) supernodes begin..end-1 of each task: disjoint subtrees, end - 1 the root; ascending."""
     above: IntArray
-    """(r, 2) the runs of supernodes that are in no task; ascending. Their descendants may be tasks. Between
-    two runs the tasks can be worked on at the same time."""
+    """(r, 2) runs begin..end-1 of the supernodes that are in no task; ascending. Small subtrees that follow
+    one another are one run, and so is a chain of supernodes whose subtrees are too large for a task."""
+    unit_of: IntArray
+    """(S,) the unit of each supernode: tasks and runs above are counted together, ascending."""
+    needs: tuple[tuple[int, ...], ...]
+    """For each unit the others with children of its supernodes; all come before it."""
     update_offsets: IntArray
-    """(S,) start of each update matrix in the stack, in units of one (block) entry. Inside a task, but for
-    its root's, they count from the start of the arena in which the task runs."""
+    """(S,) start of each update matrix, in (block) entries: in the arena where its unit runs, if the parent
+    is in the same unit, else in the stack, where one thread does all; see `FrontMemory`."""
     stack_size: int
-    """(Block) entries of the stack of update matrices, without arenas."""
+    """(Block) entries of that stack."""
     arena_size: int
-    """(Block) entries that a running task needs for itself."""
+    """(Block) entries that a running unit needs for itself."""
     largest_front: int
     """Rows of the tallest panel."""
     edge_pointers: IntArray
@@ -110,6 +114,11 @@ class SymbolicFactor:
     """Entries of the scalar factor L without any explicit zero."""
     flops: float
     """Multiplications and additions of the scalar factorization, without explicit zeros."""
+
+    @property
+    def units(self) -> IntArray:
+        """The tasks and the runs above them, (U, 2), ascending."""
+        return np.sort(np.concatenate([self.tasks, self.above]), axis=0)
 
     @property
     def num_nodes(self) -> int:
@@ -169,7 +178,9 @@ def plan_factorization(graph: Adjacency, edges: IntArray, tree: EliminationTree)
     relative = _relative_positions(first, parent, row_pointers, rows)
     sizes = np.diff(first) * (np.diff(first) + below)
     tasks, above = _tasks(parent, sizes)
-    offsets, stack_size, arena_size = _stack_plan(parent, below, tasks)
+    units = np.sort(np.concatenate([tasks, above]), axis=0)
+    unit_of = np.repeat(np.arange(len(units)), units[:, 1] - units[:, 0])
+    offsets, stack_size, arena_size = _stack_plan(parent, below, units, unit_of)
     children = np.argsort(parent, kind="stable")[int(np.sum(parent < 0)) :]
     child_pointers = np.searchsorted(parent[children], np.arange(len(parent) + 1))
     i, j = inverse[edges.T]
@@ -189,6 +200,8 @@ def plan_factorization(graph: Adjacency, edges: IntArray, tree: EliminationTree)
         panel_pointers=frozen(np.concatenate([[0], np.cumsum(sizes)])),
         tasks=frozen(tasks),
         above=frozen(above),
+        unit_of=frozen(unit_of),
+        needs=_needs(parent, unit_of, len(units)),
         update_offsets=frozen(offsets),
         stack_size=stack_size,
         arena_size=arena_size,
@@ -405,8 +418,24 @@ def _tasks(parent: IntArray, sizes: IntArray) -> tuple[IntArray, IntArray]:
     is_root = (parent < 0) | (weight[parent] > _LARGEST_TASK * total)
     roots = np.flatnonzero(is_root & (weight <= _LARGEST_TASK * total) & (weight >= _SMALLEST_TASK * total))
     tasks = np.stack([begin[roots], roots + 1], axis=1)
-    edges = np.concatenate([[0], tasks.ravel(), [num]]).reshape(-1, 2)
-    return tasks, edges[edges[:, 0] < edges[:, 1]]
+    is_large = weight > _LARGEST_TASK * total
+    # The only child of a large one is the supernode before it; such chains are not cut.
+    is_next = (np.bincount(parent[parent >= 0], minlength=num) == 1) & np.append(False, is_large[:-1])
+    cuts = [
+        np.flatnonzero(is_large & ~is_next),
+        np.flatnonzero(is_large & ~np.append(is_next[1:], False)) + 1,
+    ]
+    bounds = np.unique(np.concatenate([[0, num], tasks.ravel(), *cuts]))
+    runs = np.stack([bounds[:-1], bounds[1:]], axis=1)
+    return tasks, runs[~np.isin(bounds[:-1], tasks[:, 0])]
+
+
+def _needs(parent: IntArray, unit_of: IntArray, num_units: int) -> tuple[tuple[int, ...], ...]:
+    """Return for each unit the others with children of its supernodes, ascending."""
+    needs = [set[int]() for _ in range(num_units)]
+    for s in np.flatnonzero((parent >= 0) & (unit_of[parent] != unit_of)):
+        needs[unit_of[parent[s]]].add(int(unit_of[s]))
+    return tuple(tuple(sorted(numbers)) for numbers in needs)
 
 
 @kernel
@@ -420,28 +449,26 @@ def _subtrees(parent: Any, sizes: Any) -> Any:
     return begin, weight
 
 
-def _stack_plan(parent: IntArray, below: IntArray, tasks: IntArray) -> tuple[IntArray, int, int]:
-    """Place the update matrices; return their offsets and the sizes of the stack and of an arena.
-
-    On the stack, a task is one leaf with the update of its root: the order of the supernodes above is kept.
-    """
-    offsets = np.zeros(len(parent), np.int64)
-    inside = np.zeros(len(parent), np.bool_)
-    arena = 0
-    for begin, end in tasks:
-        offsets[begin:end], size = _stacked(parent[begin:end] - begin, below[begin:end], end - 1 - begin)
+def _stack_plan(
+    parent: IntArray, below: IntArray, units: IntArray, unit_of: IntArray
+) -> tuple[IntArray, int, int]:
+    """Place the update matrices inside units; return offsets, and the sizes of stack and arena."""
+    offsets, arena = np.zeros(len(parent), np.int64), 0
+    for begin, end in units:
+        offsets[begin:end], size = _stacked(parent[begin:end] - begin, below[begin:end])
         arena = max(arena, int(size))
-        inside[begin : end - 1] = True
-    top = np.flatnonzero(~inside)
-    rank = np.cumsum(~inside) - 1
-    above = np.where(parent[top] < 0, -1, rank[parent[top]])
-    offsets[top], stack = _stacked(above, below[top], -1)
+    leaves = (parent < 0) | (unit_of[parent] != unit_of)
+    top, rank = np.flatnonzero(leaves), np.cumsum(leaves) - 1
+    last_of_parent = units[unit_of[parent[top]], 1] - 1  # leaves its unit, which has others below it, alone
+    offsets[top], stack = _stacked(np.where(parent[top] < 0, -1, rank[last_of_parent]), below[top])
     return offsets, int(stack), arena
 
 
 @kernel
-def _stacked(parent: Any, below: Any, root: int) -> Any:
-    """Place each update matrix on one of two stacks that grow towards each other; `root`'s is elsewhere.
+def _stacked(parent: Any, below: Any) -> Any:
+    """Place each update matrix on one of two stacks that grow towards each other.
+
+    One whose parent is beyond the last supernode, or that has none, is elsewhere.
 
     A front reads its children's updates and writes its own. With the levels of the tree on alternating
     stacks, both are at the top of their stack and nothing is ever copied. Offsets of the second stack
@@ -457,7 +484,7 @@ def _stacked(parent: Any, below: Any, root: int) -> Any:
     freed = np.full(num, -1, np.int64)  # where the children's stack stood before the first child
     size = 0
     for s in range(num):
-        side, area = level[s], 0 if s == root else below[s] * below[s]
+        side, area = level[s], below[s] * below[s] if 0 <= parent[s] < num else 0
         offsets[s] = top[side]
         top[side] += area
         size = max(size, top[0] + top[1])
@@ -467,7 +494,7 @@ def _stacked(parent: Any, below: Any, root: int) -> Any:
             freed[parent[s]] = offsets[s]
     for s in range(num):
         if level[s] == 1:
-            offsets[s] = size - offsets[s] - (0 if s == root else below[s] * below[s])
+            offsets[s] = size - offsets[s] - (below[s] * below[s] if 0 <= parent[s] < num else 0)
     return offsets, size
 
 

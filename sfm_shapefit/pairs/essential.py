@@ -114,7 +114,7 @@ def refine_rough_rotations(
     """
     i, j = batch.pairs.T
     rotations = rotations[j] @ rotations[i].transpose(0, 2, 1)
-    turns = np.repeat(rotations, np.diff(batch.offsets), axis=0)
+    turns = batch.spread(rotations)
     normals = np.cross(np.einsum("mab,mb->ma", turns, batch.rays_i), batch.rays_j)
     products = np.append(normals[:, :, None] * normals[:, None, :], np.zeros((1, 3, 3)), axis=0)
     sums = np.add.reduceat(products, batch.offsets[:-1], axis=0)
@@ -161,7 +161,7 @@ def _start_by_trials(matches: RayMatches, are_many: bool) -> tuple[BoolArray, Fl
         options.mergedict(_FEWER_TRIALS)
     for p in range(k):
         options.max_error = _INLIER_PX * float(matches.pixel_angles[p])
-        first, second = (side[tried.offsets[p] : tried.offsets[p + 1]] for side in pixels)
+        first, second = (side[tried.slice_of(p)] for side in pixels)
         estimate = pycolmap.estimate_essential_matrix(first, second, camera, camera, options)
         if estimate is None:
             continue

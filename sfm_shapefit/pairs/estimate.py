@@ -44,7 +44,7 @@ def _judge(
     options: DirectionOptions,
 ) -> PairDirections:
     """Decide which estimates to believe, and give the others their reason."""
-    num_matches = np.diff(matches.offsets)
+    num_matches = matches.lengths()
     inliers, front, behind, voters, rivals, loyal, residual_px, parallax_rad = measures.T
     covariance = _tangent_covariance(moments)
     sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))

@@ -7,12 +7,12 @@ smaller steps from the best of it. Lenses of one model, size and guess are off b
 """
 
 from collections import defaultdict
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.lists import Lists, offsets_of
 from sfm_shapefit.pairs.essential import LikelyPoses, estimate_relative_rotations
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.scene.lens import Lens
@@ -34,7 +34,8 @@ _MOST_KINDS = 8  # kinds of lenses, those of most images; each takes a second
 _MOST_PAIRS, _FEWEST_MATCHES, _MOST_MATCHES = 24, 40, 200
 
 
-class _PixelMatches(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class _PixelMatches(Lists):
     """Matches of k pairs, M in all, one pair after the other."""
 
     offsets: IntArray
@@ -87,8 +88,9 @@ def _choose_matches(view: View, own: BoolArray, known: BoolArray) -> _PixelMatch
     pixels, pairs = [np.zeros((0, 2, 2))], [np.zeros((0, 2), dtype=np.int64)]
     for batch in view.links(chosen=is_chosen):
         pairs.append(batch.pairs)
-        for (i, j), first, last in zip(batch.pairs.tolist(), batch.offsets, batch.offsets[1:], strict=False):
-            even = np.linspace(first, last - 1, min(last - first, _MOST_MATCHES)).astype(np.int64)
+        for (i, j), rows in zip(batch.pairs.tolist(), batch.slices(), strict=True):
+            number = min(rows.stop - rows.start, _MOST_MATCHES)
+            even = np.linspace(rows.start, rows.stop - 1, number).astype(np.int64)
             left, right = batch.keypoints[even].T
             pixels.append(np.stack([view.keypoints(i)[left], view.keypoints(j)[right]], axis=1))
     offsets = np.cumsum([len(part) for part in pixels])
@@ -138,7 +140,7 @@ def _fit(
 def _rays(matches: _PixelMatches, lenses: tuple[Lens, ...], own: BoolArray, factor: float) -> RayMatches:
     """Return the matches whose pixels have rays; pair p is (p, p)."""
     scaled = [lens.longer(factor) if own[k] else lens for k, lens in enumerate(lenses)]
-    pair_of = np.repeat(np.arange(len(matches.lenses)), np.diff(matches.offsets))
+    pair_of = matches.list_of_rows()
     rays = np.empty((*matches.pixels.shape[:2], 3))
     for k in np.unique(matches.lenses).tolist():
         sees = matches.lenses[pair_of] == k
@@ -148,7 +150,7 @@ def _rays(matches: _PixelMatches, lenses: tuple[Lens, ...], own: BoolArray, fact
     focal_lengths_px = np.array([lens.focal_px for lens in scaled])[matches.lenses]
     return RayMatches(
         pairs=np.repeat(np.arange(len(counts))[:, None], 2, axis=1),
-        offsets=np.append(0, np.cumsum(counts)),
+        offsets=offsets_of(counts),
         rays_i=rays[has_ray, 0],
         rays_j=rays[has_ray, 1],
         pixel_angles=1.0 / focal_lengths_px.min(axis=1),

@@ -18,7 +18,6 @@ CVPR 2008; Wilson, Snavely, "Network principles for SfM: disambiguating repeated
 context", ICCV 2013.
 """
 
-import itertools
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -37,10 +36,9 @@ def count_partners(num_keypoints: Sequence[int], batches: Iterable[KeypointMatch
     """Return in how many pairs each keypoint of each image is matched, from the matches of all pairs."""
     counts = [np.zeros(count, dtype=np.int64) for count in num_keypoints]
     for batch in batches:
-        for k, ends in enumerate(batch.pairs.tolist()):
-            matched = batch.keypoints[batch.offsets[k] : batch.offsets[k + 1]]
+        for ends, own in zip(batch.pairs.tolist(), batch.slices(), strict=True):
             for side, image in enumerate(ends):
-                counts[image][matched[:, side]] += 1  # once, even where it is matched twice
+                counts[image][batch.keypoints[own, side]] += 1  # once, even where it is matched twice
     return counts
 
 
@@ -61,7 +59,7 @@ def matched_shares(
         return np.zeros(0)
     images = {k: _Image.of(pixels[k], sizes[k], partners[k]) for k in np.unique(batch.pairs).tolist()}
     own, pairs = np.empty((2, len(batch.keypoints), 2)), batch.pairs.tolist()
-    rows = [slice(*ends) for ends in itertools.pairwise(batch.offsets.tolist())]
+    rows = batch.slices()
     for part, ends in zip(rows, pairs, strict=True):
         for side, k in enumerate(ends):
             own[side, part] = pixels[k][batch.keypoints[part, side]]

@@ -85,7 +85,7 @@ def refine_two_view_poses(
         pairs=matches.pairs,
         rotations=turns,
         information=information,
-        num_matches=np.diff(matches.offsets),
+        num_matches=matches.lengths(),
         weight_shares=shares,
         translations=shifts,
     )

@@ -19,6 +19,7 @@ from sfm_shapefit.adjustment.sources import collect_tracks
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.executors import Crew
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays
@@ -176,7 +177,7 @@ def adjust_joined(reconstruction: "pycolmap.Reconstruction", threads: int) -> "p
     """
     read, _ = arrays_of(reconstruction)
     images, points, tracks = read_bundle(read)
-    run = begin(images, tracks, StructureOptions(), Freedom(), threads=threads)
+    run = begin(images, tracks, StructureOptions(), Freedom(), crew=Crew(threads))
     run, last = solve_known_points(run, points.xyz)
     return moved_reconstruction(read, run.images, replace(points, xyz=last.points))
 

@@ -45,7 +45,7 @@ def pull_cameras(state: ModelState) -> ModelState:
     Priors without a standard deviation do not pull, nor do those whose axes are not known.
     """
     known = state.inputs.known
-    if known.priors is None or known.control is not None or state.frame.scale != "prior":
+    if known.priors is None or known.sets_scale or state.frame.scale != "prior":
         return state
     priors, options = known.priors.with_sigmas(), state.inputs.options.placement
     limited = state.source.memory_plan.limit(options)
@@ -73,8 +73,8 @@ def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
     if source.fixed is not None:  # points that fixed images alone see move nothing
         links = links_touching(start, links, ~source.fixed[rows])
     freedom = replace(state.freedom_of(rows), pull_rad=state.inputs.pull_rad)
-    given = state.given_poses(rows)
-    adjusted = adjust_placement(begin(start, links, options.structure, freedom, given, clock.threads))
+    given, crew = state.given_poses(rows), state.crew_of(clock)
+    adjusted = adjust_placement(begin(start, links, options.structure, freedom, given, crew))
     del links
     similarity, centers = state.frame.similarity, np.empty((images.num_images, 3))
     centers[rows] = adjusted.images.centers

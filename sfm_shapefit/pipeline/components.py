@@ -14,6 +14,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.forests import connected_components
+from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
@@ -76,7 +77,7 @@ def start_run(
         matches = DatabaseMatches(file, images.names)
         images, intrinsics = choose_intrinsics(images, matches, options.freedom.intrinsics, inputs.left_out)
         gauge = between_images(options.gauge, images.names, "the database has no image")
-        known = read_known(images, file, priors, options.gauge.control_points, options.averaging.gravity)
+        known = read_known(images, file, priors, options.gauge, options.averaging.gravity)
     return MapContext(
         options=replace(options, gauge=gauge),
         clock=clock,
@@ -271,8 +272,7 @@ def _others(count: int) -> str:
 
 def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:
     """Return the connected components, ascending, the largest first; single frames are components too."""
-    labels = connected_components(num_frames, pairs)
-    groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
+    groups = RowLists.by_label(connected_components(num_frames, pairs))
     return sorted(groups, key=lambda group: (-len(group), int(group[0])))
 
 

@@ -186,7 +186,7 @@ def _weighed(directions: PairDirections, num_images: int) -> BoolArray:
 def _thin(images: Images, batch: RayMatches) -> RayMatches:
     """Return pairs with few of their matches, taken evenly, their rays in camera axes."""
     thin = batch.thinned(_MOST_MATCHES)
-    turns = np.repeat(images.rotations[thin.pairs], np.diff(thin.offsets), axis=0)
+    turns = thin.spread(images.rotations[thin.pairs])
     rays_i, rays_j = (
         np.einsum("kab,kb->ka", turns[:, side], rays) for side, rays in enumerate((thin.rays_i, thin.rays_j))
     )

@@ -1,7 +1,6 @@
 """What other pipelines call: `global_mapping`, as pycolmap has it, and `average_database`."""
 
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,12 +12,14 @@ from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pipeline.components import start_run
+from sfm_shapefit.pipeline.execution import workers_of
 from sfm_shapefit.pipeline.map import map_database, measure_run
 from sfm_shapefit.pipeline.write import WriteOptions, deliver
 from sfm_shapefit.scene.points import number_points
 
 if TYPE_CHECKING:
     import pycolmap
+    from distributed import Client
 
 _TAKEN = {"num_threads": "threads", "min_num_matches": "min_matches", "min_model_size": "min_model_size"}
 """Options of pycolmap that have a counterpart here, and its name."""
@@ -76,7 +77,7 @@ def average_database(
     options: MapOptions | None = None,
     *,
     progress: Progress | None = None,
-    executor: Executor | None = None,
+    client: "Client | None" = None,
     **overrides: Any,
 ) -> "pycolmap.Reconstruction":
     """Average the rotations of a database; what `map_database` does before it places any camera.
@@ -88,7 +89,7 @@ def average_database(
         database: as for `map_database`; it is never changed.
         options: settings, see `help(MapOptions)`; defaults if None.
         progress: called as stages advance.
-        executor: shares out the pairs among its workers.
+        client: of dask.distributed, whose workers share out the pairs.
         **overrides: single options by name: `average_database(database, gravity="gravity.txt")`.
 
     Returns:
@@ -99,8 +100,9 @@ def average_database(
         UnsolvableError: if no three images have rotations that agree.
     """
     options = merge_options(options, MapOptions, overrides)
-    clock = Clock.of(progress, options.placement.solver.threads, executor)
-    with closing(DatabaseFile(database_in(Path(database)))) as file:
+    path = database_in(Path(database))
+    clock = Clock.of(progress, options.placement.solver.threads, workers_of(client, path))
+    with closing(DatabaseFile(path)) as file:
         run, relative, *_ = measure_run(start_run(file, options, clock, None))
         reasons: dict[int, str] = {}
         components = list(run.average_images(relative, reasons))

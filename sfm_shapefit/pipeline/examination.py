@@ -12,6 +12,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.base.geometry import fit_similarity
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.files.colmap.lenses import is_bogus
 from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
@@ -284,12 +285,12 @@ def lost_points(view: View, structure: Structure, fits: BoolArray, group: IntArr
     lost, carried = np.zeros((2, points.num_points), dtype=np.bool_)
     if not (across.any() and _has_keypoints(view, structure)):
         return lost
-    begins = np.append(0, np.cumsum(view.num_keypoints))
+    begins = offsets_of(view.num_keypoints)
     point_of, fitting = np.full(begins[-1], -1), np.zeros(begins[-1], dtype=np.bool_)
     seen = begins[points.images] + points.keypoints
     point_of[seen], fitting[seen] = points.points_seen(), fits
     for batch in view.links(chosen=across):
-        pair = np.repeat(np.arange(len(batch.pairs)), np.diff(batch.offsets))
+        pair = batch.list_of_rows()
         seen_by, keypoints = batch.pairs[pair], begins[batch.pairs[pair]] + batch.keypoints
         ends = point_of[keypoints]
         same = (ends[:, 0] == ends[:, 1]) & fitting[keypoints].all(axis=1)

@@ -15,6 +15,7 @@ from sfm_shapefit.facts.warnings import rotation_suspicions, rotation_warnings
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.judgement.uncertainty import standard_deviations
+from sfm_shapefit.pipeline.lengths import usual_length
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, coincide
 from sfm_shapefit.placement.gauge_rule import SETS_SCALE
@@ -55,6 +56,8 @@ def finish_model(state: ModelState, clock: Clock) -> LocateResult:
         intrinsics=state.intrinsics,
         rigs=refined_rigs(inputs.images, state.images, state.freedom, done),
         control_points=state.control,
+        scale_bars=state.bars.rows() if state.bars else (),
+        lengths=usual_length(state),
         suspicions=state.reasons,
     )
     result = replace(result, warnings=tuple(_warnings(result, state)))

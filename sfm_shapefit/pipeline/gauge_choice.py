@@ -8,19 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_shapefit.adjustment.scale_bars import fit_scale_bars
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import Similarity, mean_rotation_l1
 from sfm_shapefit.facts.control_points import control_rows, control_warnings
-from sfm_shapefit.files.colmap.control_points import look_at_marks
+from sfm_shapefit.files.colmap.marks import look_at_marks
+from sfm_shapefit.pipeline.lengths import measure_bars, scale_errors
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.control_points import (
     control_gauge,
     fit_control_points,
-    triangulate_control_points,
+    triangulate_marks,
 )
-from sfm_shapefit.placement.gauge_rule import say_unused
+from sfm_shapefit.placement.gauge_rule import resized_gauge, say_unused
 from sfm_shapefit.placement.prior_refinement import PULLED
-from sfm_shapefit.scene.given import ControlPoints, Gravity
+from sfm_shapefit.scene.given import ControlPoints, Gravity, ScaleBars
 
 
 def bring_to_gauge(state: ModelState) -> ModelState:
@@ -67,13 +69,15 @@ def bring_to_known(state: ModelState) -> ModelState:
     known = state.inputs.known
     if known.control is not None:
         state = _bring_to_control_points(state, known.control)
+    if known.bars is not None:
+        state = _bring_to_scale_bars(state, known.bars)
     return state if known.gravity is None else _turn_upright(state, known.gravity)
 
 
 def _bring_to_control_points(state: ModelState, known: ControlPoints) -> ModelState:
     moves, resize = not state.inputs.fixed.any(), state.placement.unit is None
     images, options = state.images, state.inputs.options.structure
-    triangulated = triangulate_control_points(known, look_at_marks(images, known), options)
+    triangulated = triangulate_marks(known, look_at_marks(images, known), options)
     fit = fit_control_points(known, triangulated.positions, resize=resize or not moves)
     warnings = list(control_warnings(known, triangulated, fit, images.names))
     rows = control_rows(known, triangulated, fit)
@@ -87,6 +91,24 @@ def _bring_to_control_points(state: ModelState, known: ControlPoints) -> ModelSt
     if isinstance(fit, str) or not moves:
         return state
     return state.moved(fit.motion, control_gauge(state.gauge, known, fit, resize=resize))
+
+
+def _bring_to_scale_bars(state: ModelState, known: ScaleBars) -> ModelState:
+    """Return a model in the scale of bars, which only check it where something else has set the scale."""
+    is_known = state.placement.unit is not None or state.inputs.fixed.any()
+    measured = measure_bars(state.images, known, state.estimate, state.inputs.options.structure)
+    fit = fit_scale_bars(known, measured.found)
+    if fit is not None and not (is_known or state.gauge.scale == "control points"):
+        middle = state.images.centers[state.images.is_posed].mean(axis=0)
+        statement = f"scale bars: {known.statement}; {fit.statement}"
+        state = state.moved(*resized_gauge(state.gauge, middle, fit.scale, fit.sigma, statement))
+        measured = measured.in_scale_of(fit)
+    else:
+        measured = measured._replace(found=measured.found.in_scale(scale_errors(state)))
+        if fit is not None:
+            scale = fit.scale
+            state = state.warned(say_unused("scale bars were", state.gauge, lambda: scale))
+    return replace(state.warned(*measured.warnings()), bars=measured)
 
 
 def _turn_upright(state: ModelState, gravity: Gravity) -> ModelState:

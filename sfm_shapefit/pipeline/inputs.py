@@ -3,6 +3,7 @@
 The view graph tells focal lengths that were only guessed before anything is placed.
 """
 
+import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -205,6 +206,8 @@ def choose_inputs(
     # The pixels of other programs' model files may differ from those of a database beside them.
     is_folder = folder is not None and not folder.is_file()
     nearby = find_database(folder) if folder is not None and is_folder else None
+    if nearby is not None and folder is not None and not folder.is_absolute():
+        nearby = Path(os.path.relpath(nearby))  # as the folder was typed
     path = Path(database) if database is not None else nearby
     if path is None:
         if source != "auto":

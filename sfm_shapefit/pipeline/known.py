@@ -11,9 +11,8 @@ from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.command_options import FIX_SOLVED, Rotations
 from sfm_shapefit.files.colmap.control_points import read_control_points
-from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
+from sfm_shapefit.files.colmap.scale_bars import read_scale_bars
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.placement.gauge_options import GaugeOptions
@@ -21,6 +20,8 @@ from sfm_shapefit.rotations.averaging_options import GRAVITY_OF_DATABASE
 from sfm_shapefit.scene.given import ControlPoints, Gravity, Known, PositionPriors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import names_among, same_images
+
+NO_GAUGE = GaugeOptions()
 
 PRIORS_OF_DATABASE = "database"
 """In place of a table or folder: the database's own pose priors."""
@@ -30,18 +31,21 @@ def read_known(
     images: Images,
     file: DatabaseFile | None,
     priors: Path | str | None = None,
-    control_points: str = "",
+    gauge: GaugeOptions = NO_GAUGE,
     gravity: str = "",
 ) -> Known:
-    """Return what the user tells of images: position priors, control points, gravity, as far as asked for."""
+    """Return what the user tells of images: priors, points, bars and gravity, as far as asked for."""
     return Known(
         priors=None if priors is None else _read_priors(images, file, priors),
-        control=_read_control(images, control_points) if control_points else None,
+        control=_read_control(images, gauge.control_points) if gauge.control_points else None,
+        bars=read_scale_bars(Path(gauge.scale_bars), images) if gauge.scale_bars else None,
         gravity=_read_gravity(images, file, gravity) if gravity else None,
     )
 
 
 def _read_priors(images: Images, file: DatabaseFile | None, source: Path | str) -> PositionPriors:
+    from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors  # few are given
+
     if str(source) == PRIORS_OF_DATABASE:
         if file is None:
             raise InputError("there is no database whose priors could be taken; give one (database=FILE)")
@@ -57,6 +61,8 @@ def _read_control(images: Images, file: str) -> ControlPoints:
 
 
 def _read_gravity(images: Images, file: DatabaseFile | None, source: str) -> Gravity:
+    from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity  # few are given
+
     if source != GRAVITY_OF_DATABASE:
         return table_gravity(Path(source), images)
     if file is None:

@@ -3,11 +3,10 @@
 Each stage is one function from values to a new value; the input is never changed.
 """
 
-from concurrent.futures import Executor
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from sfm_shapefit.files.colmap.listed_poses import read_source
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
+from sfm_shapefit.pipeline.execution import workers_of
 from sfm_shapefit.pipeline.inputs import (
     RunInputs,
     choose_inputs,
@@ -32,6 +32,9 @@ from sfm_shapefit.pipeline.known import between_images, pull_of_rotations, read_
 from sfm_shapefit.pipeline.memory import see_within_limit
 from sfm_shapefit.pipeline.remedies import make_model
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 _ROUGH_RAD = np.radians(0.3)  # radians; directions of pairs are not measured by rotations farther off
 _NOT_CORRECTED = "rough rotations beside fixed images are not corrected; --fix needs better ones"
 
@@ -43,7 +46,7 @@ def locate(
     options: LocateOptions | None = None,
     progress: Progress | None = None,
     priors: Path | str | None = None,
-    executor: Executor | None = None,
+    client: "Client | None" = None,
     **overrides: Any,
 ) -> LocateResult:
     """Place the cameras of a model whose rotations and intrinsics are known.
@@ -65,8 +68,8 @@ def locate(
         progress: called as stages advance, with the stage, the work done and the work in all.
         priors: a table of position priors, see `files.colmap.priors`, the folder of the images, whose EXIF
             data have them, or "database" for its own pose priors.
-        executor: shares out pairs among its workers, which must see the file of the database, with
-            the same answer to the bit; it is not shut down. None: all is done here.
+        client: of dask.distributed; its workers, which must see the file of the database, share the work,
+            with the same answer to the bit. None: all is done here.
 
     Returns:
         `reconstruction`, the seeded model: cameras placed, points triangulated, all else unregistered;
@@ -76,12 +79,12 @@ def locate(
     Raises:
         InputError: if the model or the database cannot be used; the message says what to do.
         UnsolvableError: if no pair has a usable direction, or the directions determine nothing.
-        WorkerError: if a worker died and the executor does not replace it.
+        WorkerError: if a worker does not see the database, or a task failed again and again.
 
     Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """
     options = merge_options(options, LocateOptions, overrides)
-    clock = Clock.of(progress, options.placement.solver.threads, executor)
+    clock = Clock.of(progress, options.placement.solver.threads)
     with ExitStack() as stack:
         with clock("read"):
             model, listed = read_source(reconstruction, database, rotations_suffice=True)
@@ -93,10 +96,11 @@ def locate(
             if options.freedom.rigs == "free" and not given.has_rigs:
                 raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
             opened, inputs = open_matches(model, inputs)
+            clock.cluster = workers_of(client, inputs.database)
             matches = stack.enter_context(closing(opened))
             wanted = options.freedom.intrinsics
             images, intrinsics = choose_intrinsics(given, matches, wanted, inputs.left_out, listed)
-            known = read_known(images, matches.file, priors, options.gauge.control_points)
+            known = read_known(images, matches.file, priors, options.gauge)
             fixed = read_fixed_images(model, options.fix)
             has_database = matches.file is not None
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)

@@ -6,25 +6,28 @@
 Images that the averaging drops form components of their own.
 """
 
-from concurrent.futures import Executor
 from contextlib import closing, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import MapResult, tell_joins
-from sfm_shapefit.facts.map_warnings import lost_distances, map_warnings
+from sfm_shapefit.facts.map_warnings import lost_bars, lost_distances, map_warnings
 from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import MapContext, start_run
+from sfm_shapefit.pipeline.execution import workers_of
 from sfm_shapefit.pipeline.mapping import join_mapped, locate_components, refine_intrinsics
 from sfm_shapefit.rotations.sequences import Loop, Videos
 from sfm_shapefit.scene.lens import FOCAL
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 _MANY_DOUBTED = 0.25
 """Share of images with doubtful intrinsics from which relative rotations are measured twice; fewer are found
@@ -38,7 +41,7 @@ def map_database(
     *,
     progress: Progress | None = None,
     priors: Path | str | None = None,
-    executor: Executor | None = None,
+    client: "Client | None" = None,
     **overrides: Any,
 ) -> MapResult:
     """Place the images of a COLMAP database: average rotations, then `locate`, for each component.
@@ -51,7 +54,7 @@ def map_database(
         progress: called as stages advance.
         priors: a table of position priors, as of `locate`. Components with fewer than two keep the scale
             "unit", and so do those, with a warning, whose priors coincide or contradict the cameras.
-        executor: shares out pairs among its workers, as of `locate`. None: all is done here.
+        client: of dask.distributed, whose workers share the work, as of `locate`. None: all is done here.
 
     Returns:
         `models`, most cameras first, each as `locate` returns it, with the rotations that it started from as
@@ -61,11 +64,12 @@ def map_database(
     Raises:
         InputError: if the database cannot be used; the message says what to do.
         UnsolvableError: if no component of three images or more can be placed.
-        WorkerError: if a worker died and the executor does not replace it.
+        WorkerError: if a worker does not see the database, or a task failed again and again.
     """
     options = merge_options(options, MapOptions, overrides)
-    clock = Clock.of(progress, options.placement.solver.threads, executor)
-    with closing(DatabaseFile(database_in(Path(database)))) as file:
+    path = database_in(Path(database))
+    clock = Clock.of(progress, options.placement.solver.threads, workers_of(client, path))
+    with closing(DatabaseFile(path)) as file:
         return map_opened(file, options, clock, priors)
 
 
@@ -104,6 +108,7 @@ def map_opened(
             *map_warnings(run.read.rigs.incomplete, models),
             *join_warnings,
             *lost_distances(run.options.gauge.known_distance, models, joined),
+            *lost_bars(run.known.bars, models, joined),
         ),
     )
     return tell_joins(result)

@@ -11,7 +11,7 @@ from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import flat_values
-from sfm_shapefit.facts.joins import JoinOutcome
+from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.model import read_model
@@ -159,7 +159,7 @@ def _suspicions(averaging: AveragedRotations) -> Iterator[Reason]:
 
 def join_mapped(
     models: Sequence[LocateResult], run: MapContext
-) -> tuple[tuple[JoinOutcome, ...], tuple[JoinedModel, ...], tuple[str, ...]]:
+) -> tuple[tuple[JoinFacts, ...], tuple[JoinedModel, ...], tuple[str, ...]]:
     """Join the models of a run, largest first, where that is safe and wanted.
 
     Returns:
@@ -182,11 +182,16 @@ def join_mapped(
     tied = tie_pieces(pieces, run.matches, run.without)
     joins = list(judge_joins(pieces, tied, priors))
     options, inputs = run.options, run.inputs
-    join_inputs = JoinInputs(joins, flat_values(options), inputs, options.gauge.known_distance, located)
+    join_inputs = JoinInputs(
+        joins, flat_values(options), inputs, options.gauge.known_distance, located=located
+    )
     joined = []
     for group in merge_groups(pieces, tied, joins):
-        source = see_matches(run.matches, read_model(group.reconstruction).images, inputs)
-        joined.append(tell_group(group, join_inputs, source, options.directions, run.clock.anew()))
+        images = read_model(group.reconstruction).images
+        rows = np.searchsorted(run.images.names, images.names)
+        told = join_inputs._replace(bars=run.known.bars and run.known.bars.of(rows))
+        source = see_matches(run.matches, images, inputs)
+        joined.append(tell_group(group, told, source, options.directions, run.clock.anew()))
     return tuple(joins), tuple(joined), tuple(warnings)
 
 

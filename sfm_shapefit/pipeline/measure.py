@@ -11,6 +11,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -68,7 +69,7 @@ def measure(
 
     Pairs of two fixed images are left out.
 
-    Workers of an executor estimate the directions of a database's pairs; what is wanted beside takes a second
+    Workers of a cluster estimate the directions of a database's pairs; what is wanted beside takes a second
     pass then.
 
     Raises:
@@ -76,7 +77,7 @@ def measure(
     """
     beside = SideResults(source, options.inlier_threshold_px, wanted, clock.threads)
     without = source.pairs_of_fixed
-    if clock.executor is not None and source.has_database:
+    if clock.cluster is not None and source.has_database:
         parts = measure_with_workers(source.view, partial(estimate_directions, options=options), clock)
         if without is not None and parts:
             every = concatenate(parts)
@@ -135,7 +136,7 @@ class SideResults:
         self._threshold_px, self._num_usable, self._counts_pairs = threshold_px, 0, wanted.facts
         is_sampled = wanted.errors and view.num_pairs <= _MOST_PAIRS
         self.errors: list[FloatArray] | None = [] if is_sampled else None
-        self._begins = np.append(0, np.cumsum(view.num_keypoints))
+        self._begins = offsets_of(view.num_keypoints)
         # Pairs of most keypoints are far below the limit of the type, 65,535.
         self._num_pairs_of = np.zeros(self._begins[-1], dtype=np.uint16)
         at_once = wanted.tracks == "always" or source.images.num_images < _MANY_CAMERAS
@@ -149,7 +150,7 @@ class SideResults:
         usable = directions.usable()
         self._num_usable += len(usable)
         for row in usable.tolist() if self._counts_pairs else ():  # faster than `np.add.at`
-            keypoints = batch.keypoints[batch.offsets[row] : batch.offsets[row + 1]]
+            keypoints = batch.keypoints[batch.slice_of(row)]
             self._num_pairs_of[self._begins[batch.pairs[row]] + keypoints] += 1
         if self._num_usable > _MAX_SAMPLED_PAIRS:
             self.errors = None

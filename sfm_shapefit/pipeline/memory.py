@@ -10,12 +10,12 @@ known. What can be given up is listed in `MEMORY_PLANS`, the cheapest first; the
 """
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.command_options import InspectOptions, PlacingOptions
-from sfm_shapefit.facts.inspected import Forecast
 from sfm_shapefit.files.colmap.database import MOST_KEYPOINTS, PIXEL_BYTES
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -27,6 +27,9 @@ from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.matches import KEPT_MATCHES, MOST_BESIDE_TRACKS
 from sfm_shapefit.solver.solve import choose_method, plan_factor
 
+if TYPE_CHECKING:
+    from sfm_shapefit.facts.inspected import Forecast
+
 _MB = 1e6  # bytes; as users count them
 _STARTED_BYTES = 195e6  # bytes; the interpreter with all that `locate` imports
 _KERNELS_BYTES = 50e6  # bytes; compiled code, thread pools, pages of the database
@@ -36,6 +39,7 @@ _SAMPLES = 96  # samples of each direction's error; two numbers each, see `judge
 _BLOCK = 9  # entries of a block of the factor; three coordinates by three
 _OBSERVATIONS_OF_A_MATCH = 0.7  # observations for a match, if keypoints are more; .45 to .66 measured
 _OBSERVATION_BYTES = 420.0  # bytes of an observation; its track, and its part of the normal equations
+_DIVIDED_BYTES = 270.0  # the same where adjustments are divided: a part has normal equations at a time
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000  # unknowns of an adjusted camera; up to as many, their system is dense
 
 
@@ -66,8 +70,10 @@ class Workload:
     """Whether the factor cannot be given up, since the solve itself works with it."""
 
 
-def forecast(work: Workload, plan: MemoryPlan = MEMORY_PLANS[0]) -> Forecast:
+def forecast(work: Workload, plan: MemoryPlan = MEMORY_PLANS[0]) -> "Forecast":
     """Return what a run will take, if so much is given up for memory."""
+    from sfm_shapefit.facts.inspected import Forecast  # here: few runs have a limit
+
     memory_mb = {stage: size / _MB for stage, size in _peaks(work, plan).items()}
     return Forecast(memory_mb=memory_mb, peak_mb=max(memory_mb.values()))
 
@@ -161,7 +167,8 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
     seeded = throughout + kept + 300.0 * work.num_edges + tracks
     if work.adjusts_bundle or (work.adjusts and plan.adjustment):
         observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches)
-        adjusting = _OBSERVATION_BYTES * observations + _adjusted_cameras_bytes(work)
+        size = _DIVIDED_BYTES if plan.divides else _OBSERVATION_BYTES
+        adjusting = size * observations + _adjusted_cameras_bytes(work)
         peaks["adjusting"] = seeded + adjusting
     peaks["triangulating"] = seeded - rays
     return peaks

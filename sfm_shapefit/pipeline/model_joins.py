@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.scale_bars import fit_scale_bars
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
 from sfm_shapefit.facts.joined_cameras import JoinedGroup, joined_camera_rows, joined_verdict
-from sfm_shapefit.facts.joins import JoinOutcome
+from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.model import JoinedFacts
 from sfm_shapefit.facts.placed import UNITS, KeyFigures
@@ -27,17 +28,18 @@ from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.reconstructions import name_of, transform_model
+from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.lengths import compare_bars
 from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.gauge_options import KnownDistance
-from sfm_shapefit.placement.gauge_rule import gauge_of_distances
+from sfm_shapefit.placement.gauge_rule import gauge_of_distances, resized_gauge
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
 from sfm_shapefit.placement.prior_join import PlacedByPriors, join_by_priors, place_by_priors
-from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.scene.given import PositionPriors, ScaleBars
 
 _SIGMA_OF = (
     "joined: what the models know of their cameras, and how well the joins are known; relative to the mean "
@@ -51,12 +53,14 @@ _SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
 class JoinInputs(NamedTuple):
     """What is known of joined models beside the models."""
 
-    joins: Sequence[JoinOutcome]
+    joins: Sequence[JoinFacts]
     """What came of joining each model to another."""
     options: Mapping[str, Any]
     inputs: Inputs
     """Where matches come from."""
     distances: Sequence[KnownDistance] = ()
+    bars: ScaleBars | None = None
+    """Scale bars with their marks in the images of the group."""
     located: Mapping[int, LocateResult] = MappingProxyType({})
     """The models by number, as far as they are ours, with what is known of their cameras."""
     notes: Sequence[str] = ()
@@ -65,7 +69,7 @@ class JoinInputs(NamedTuple):
 
 def judge_joins(
     pieces: Sequence[ModelPiece], tied: TiedPieces, priors: Sequence[PositionPriors | None] = ()
-) -> Iterator[JoinOutcome]:
+) -> Iterator[JoinFacts]:
     """Yield what comes of joining each piece but the first: by pairs, or else by `priors` of its cameras."""
     outcomes = join_pieces(tied.cameras, tied.ties)
     usable = [] if tied.cameras.is_metric.any() else priors
@@ -76,16 +80,9 @@ def judge_joins(
             other = _join_by_priors(number, placed)
             done = other if isinstance(other, PieceJoin) or done == UNTIED else done
         join = _at_known_scale(pieces, done) if isinstance(done, PieceJoin) else None
-        to = 0 if join is None else join.to
         pairs = [] if join is None else tied.ties.matches.pairs[join.rivals].tolist()
-        yield JoinOutcome(
-            model=number,
-            to=to,
-            found=join,
-            reason=str(done) if join is None else join.reason,
-            labels=(pieces[number].label, pieces[to].label),
-            rivals=tuple((tied.names[v], tied.names[w]) for v, w in pairs),
-        )
+        rivals = [(tied.names[v], tied.names[w]) for v, w in pairs]
+        yield JoinFacts.of_models([piece.label for piece in pieces], number, join or str(done), rivals)
 
 
 def _at_known_scale(pieces: Sequence[ModelPiece], join: PieceJoin) -> PieceJoin:
@@ -96,7 +93,7 @@ def _at_known_scale(pieces: Sequence[ModelPiece], join: PieceJoin) -> PieceJoin:
     if not all(one.model.images.has_rigs for one in two):
         return replace(join, reason="only one of them has rigs of several cameras, and a scale by that")
     if not all(one.is_metric for one in two):
-        return replace(join, reason="their rigs do not tell the scale of both")
+        return replace(join, reason="their rigs do not give the scale of both")
     sigma = float(np.linalg.norm([one.scale_sigma or 0.0 for one in two]))
     # Errors of the size of the second model move its cameras about their middle.
     center_sigma = float(np.hypot(join.center_sigma, sigma * median_spread(two[1].model.images.centers)))
@@ -126,16 +123,16 @@ def _join_by_priors(number: int, placed: Sequence[PlacedByPriors | str]) -> Piec
 
 
 def merge_groups(
-    pieces: Sequence[ModelPiece], tied: TiedPieces, joins: Sequence[JoinOutcome]
+    pieces: Sequence[ModelPiece], tied: TiedPieces, joins: Sequence[JoinFacts]
 ) -> list[JoinedGroup]:
     """Return the pieces that were joined, each group in the world of its first."""
     growing: dict[int, _Growing] = {}
     root = list(range(len(pieces)))
     for done in joins:
         if done.join is not None:
-            first = root[done.model] = root[done.to]
+            first = root[done.number] = root[done.to_number]
             group = growing[first] = growing.get(first) or _Growing(pieces[first], first)
-            group.add(done, pieces[done.model], tied)
+            group.add(done, pieces[done.number], tied)
     return [growing[number].group for number in sorted(growing)]
 
 
@@ -149,18 +146,18 @@ class _Growing:
         self.ids: dict[int, Mapping[int, int]] = {number: {i: i for i in reconstruction.point3D_ids()}}
         """New ids of each piece's points, by the old ones."""
 
-    def add(self, done: JoinOutcome, piece: ModelPiece, tied: TiedPieces) -> None:
+    def add(self, done: JoinFacts, piece: ModelPiece, tied: TiedPieces) -> None:
         """Take in a piece that was joined to one of the group."""
         assert done.join is not None
-        world_from = compose(self.group.world_from[done.to], done.join.to_from_piece)
-        worlds = {**self.group.world_from, done.model: world_from}
+        world_from = compose(self.group.world_from[done.to_number], done.join.to_from_piece)
+        worlds = {**self.group.world_from, done.number: world_from}
         same = self._same_points(done.join, worlds, tied)
         ours, theirs = self.group.reconstruction, piece.model.reconstruction
         merged, renamed, new = merge_models(ours, theirs, world_from, same)
         for number, ids in self.ids.items():
             self.ids[number] = {point: renamed.get(now, now) for point, now in ids.items()}
-        self.ids[done.model] = new
-        ends = [np.flatnonzero(tied.cameras.piece_of == k)[:2] for k in (done.model, done.to)]
+        self.ids[done.number] = new
+        ends = [np.flatnonzero(tied.cameras.piece_of == k)[:2] for k in (done.number, done.to_number)]
         names = dict.fromkeys(tied.names[v] for v in np.concatenate(ends).tolist())
         known = (*self.group.tied, *itertools.combinations(names, 2))
         self.group = JoinedGroup(merged, worlds, (*self.group.joins, done), known)
@@ -187,7 +184,7 @@ class _Growing:
 def _fitting(tied: TiedPieces, pair: int, worlds: Mapping[int, Similarity]) -> tuple[slice, BoolArray]:
     """Return the matches of a pair, and which of them see, from each side, the point of the other side."""
     ties = tied.ties.matches
-    rows = slice(*ties.offsets[pair : pair + 2].tolist())
+    rows = ties.slice_of(pair)
     off, ends = np.zeros(rows.stop - rows.start), ties.pairs[pair].tolist()
     end_worlds = [worlds[int(tied.cameras.piece_of[v])] for v in ends]
     for way, rays in enumerate((ties.rays_i[rows], ties.rays_j[rows])):
@@ -204,12 +201,12 @@ def tell_group(
     """Return joined models with what can be said of them; `source` has the matches of their images."""
     first, located = next(iter(group.world_from)), join_inputs.located
     labels = {
-        k: label for one in group.joins for k, label in zip((one.model, one.to), one.labels, strict=True)
+        k: name for one in group.joins for k, name in ((one.number, one.model), (one.to_number, one.to))
     }
     folder = f"joined_{first}" if located else "."
     gauge = Gauge(scale="input", similarity=_SAME, statement="input: those of the first model")
     if first in located:
-        gauge, group = _choose_scale(group, located[first].gauge, join_inputs.distances)
+        gauge, group = _choose_scale(group, located[first].gauge, join_inputs)
     model = read_model(group.reconstruction)
     rows = {name: k for k, name in enumerate(model.images.names)}
     tied = np.array([(rows[a], rows[b]) for a, b in group.tied], dtype=np.int64).reshape(-1, 2)
@@ -217,13 +214,17 @@ def tell_group(
     checked = check_source(model, source, options, clock)
     seen, measures = checked.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
     cameras = joined_camera_rows(checked.cameras, group, located)
+    bars = join_inputs.bars and compare_bars(model.images, join_inputs.bars, None, gauge.scale_sigma)
     facts = JoinedFacts.taken_from(
         seen,
         inputs=join_inputs.inputs.facts,
         options=dict(join_inputs.options),
         verdict=joined_verdict(seen.verdict, group, located),
-        models=[labels[number].removeprefix("model ") for number in group.world_from],
-        joins=[one.facts(folder if one.join and one.model in labels else None) for one in join_inputs.joins],
+        models=[labels[number] for number in group.world_from],
+        joins=[
+            replace(one, folder=folder if one.joined and one.number in labels else None)
+            for one in join_inputs.joins
+        ],
         num_images=len(cameras),
         num_placed=group.reconstruction.num_reg_images(),
         figures=KeyFigures.of_cameras(cameras, seen.figures.pair_error_deg, *measures),
@@ -231,9 +232,13 @@ def tell_group(
         scale=gauge.statement,
         scale_sigma=gauge.scale_sigma,
         known_distances=told_distances(join_inputs.distances, model.images),
+        scale_bars=bars.rows() if bars else (),
         datum=gauge.datum,
         timings_s=clock.seconds,
-        warnings=[*join_inputs.notes, *seen.warnings, *filter(None, [gauge.warning])],
+        warnings=[
+            *(*join_inputs.notes, *seen.warnings, *filter(None, [gauge.warning])),
+            *(bars.warnings() if bars else ()),
+        ],
     )
     return JoinedModel(
         reconstruction=group.reconstruction,
@@ -245,29 +250,37 @@ def tell_group(
     )
 
 
-def _choose_scale(
-    group: JoinedGroup, first: Gauge, known: Sequence[KnownDistance]
-) -> tuple[Gauge, JoinedGroup]:
+def _choose_scale(group: JoinedGroup, first: Gauge, join_inputs: JoinInputs) -> tuple[Gauge, JoinedGroup]:
     """Return the gauge of joined models, and the models in it.
 
-    A scale that the first model knows stays. An arbitrary scale gives way to known distances, within a model
-    or between two.
+    A scale that the first model knows stays. An arbitrary scale gives way to scale bars or known distances,
+    within a model or between two.
     """
-    number = next(iter(group.world_from))
-    placed = {name_of(image): image for image in group.reconstruction.images.values() if image.has_pose}
-    distances = [one for one in known if {*one[:2]} <= placed.keys()]
-    warning = ""
-    if first.scale in _ARBITRARY and distances:
-        centers = np.array([image.projection_center() for image in placed.values()])
+    images, warning = read_model(group.reconstruction).images, ""
+    distances = [one for one in join_inputs.distances if {*one[:2]} <= {*images.names}]
+    if first.scale in _ARBITRARY:
+        known = join_inputs.bars
+        fit = known and fit_scale_bars(known, compare_bars(images, known, None, None).found)
+        if known and fit:
+            middle, said = (
+                images.centers.mean(axis=0),
+                f"scale bars: {known.statement}; {fit.statement}",
+            )
+            motion, gauge = resized_gauge(first, middle, fit.scale, fit.sigma, said)
+            return gauge, _moved(group, motion)
         try:
-            gauge = gauge_of_distances(list(placed), centers, distances)
+            if distances:
+                gauge = gauge_of_distances(images.names, images.centers, distances)
+                return gauge, _moved(group, gauge.similarity)
         except InputError as error:  # two cameras stand in one place
             warning = str(error)
-        else:
-            world = group.world_from.items()
-            return gauge, group._replace(
-                reconstruction=transform_model(group.reconstruction, gauge.similarity),
-                world_from={number: compose(gauge.similarity, one) for number, one in world},
-            )
-    statement = f"that of model {number}: {first.statement}"
+    statement = f"that of model {next(iter(group.world_from))}: {first.statement}"
     return replace(first, statement=statement, warning=warning), group
+
+
+def _moved(group: JoinedGroup, motion: Similarity) -> JoinedGroup:
+    """Return joined models after a similarity of their world."""
+    return group._replace(
+        reconstruction=transform_model(group.reconstruction, motion),
+        world_from={number: compose(motion, one) for number, one in group.world_from.items()},
+    )

@@ -11,6 +11,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import METRIC_SIGMA, normalized
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model, renamed_as
 from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of
@@ -115,7 +116,7 @@ def tie_pieces(pieces: Sequence[ModelPiece], matches: Matches | None, left_out: 
     ties = PieceTies(
         matches=RayMatches(
             pairs=np.reshape(np.array(first, dtype=np.int64), (-1, 2)),
-            offsets=np.append(0, np.cumsum(counts)).astype(np.int64),
+            offsets=offsets_of(counts),
             rays_i=np.concatenate([np.zeros((0, 3)), *(one.rays[0] for one in links)]),
             rays_j=np.concatenate([np.zeros((0, 3)), *(one.rays[1] for one in links)]),
             pixel_angles=np.array([one.pixel_angle for one in links]),
@@ -216,8 +217,7 @@ class _Seen:
         view = matches.at(images, left_out)
         ids = {}
         for batch in view.between(labels):
-            for k, (i, j) in enumerate(batch.pairs.tolist()):
-                rows = slice(int(batch.offsets[k]), int(batch.offsets[k + 1]))
+            for k, ((i, j), rows) in enumerate(zip(batch.pairs.tolist(), batch.slices(), strict=True)):
                 if rows.stop - rows.start < _LEAST_MATCHES:
                     continue
                 ends = [self.of_name[images.names[end]] for end in (i, j)]
@@ -243,7 +243,7 @@ class _Seen:
         names = sorted(self.of_name)
         first = [self.of_name[name][0] for name in names]
         every = [piece.model.images for piece in self.pieces]
-        begins = np.cumsum([0, *(len(images.lenses) for images in every)])
+        begins = offsets_of([len(images.lenses) for images in every])
         lenses = [lens for images in every for lens in images.lenses]
         lens_of = np.concatenate([n + images.lens_of for n, images in zip(begins, every, strict=False)])
         used, lens_of_image = np.unique(lens_of[first], return_inverse=True)

@@ -32,7 +32,8 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table
+from sfm_shapefit.facts.scale_bars import MeasuredBars
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table, contradicting
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -94,6 +95,13 @@ class CheckResult(Reported, Stated):
         from sfm_shapefit.report.results import draw_checked
 
         return draw_checked(self.model, self.cameras, self.pairs, self.quality)
+
+    def with_bars(self, bars: MeasuredBars | None) -> "CheckResult":
+        """Return the same with scale bars that were compared with the model."""
+        if bars is None:
+            return self
+        warnings = [*self.facts.warnings, *bars.warnings()]
+        return replace(self, facts=replace(self.facts, scale_bars=bars.rows(), warnings=warnings))
 
     def _headline(self) -> str:
         return f"{self.facts.num_placed} of {self.facts.num_images} images, {self.verdict.statement}"
@@ -235,7 +243,7 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
     named = [one for one in state.reasons if one.of_each and one.kind is not Kind.SECOND_OPINION]
     cameras = _camera_rows(model, fits, [*state.weak, *(one for one in named if one not in state.weak)])
     residuals_deg = pairs.columns["residual_deg"]
-    error_deg = _median(residuals_deg[np.isfinite(residuals_deg)].tolist())
+    error_deg = _median(residuals_deg[np.isfinite(residuals_deg) & ~contradicting(pairs)].tolist())
     errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
     facts = CheckedFacts(
         inputs=source.inputs.facts,
@@ -327,12 +335,12 @@ def _reasons(state: CheckState) -> Iterator[Reason]:
     pointless = not (model.num_points or structure.points.num_points)
     centers = model.images.centers
     if np.ptp(centers, axis=0).max() <= _ROUNDING * np.abs(centers).max():
-        clause = "all its cameras stand at the same place; place them with sfm-shapefit locate"
+        clause = "all its cameras are at the same place; place them with sfm-shapefit locate"
         yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
         return
     if fits is None or not (fits.contradicts.any() or np.isfinite(fits.residuals_deg).any()):
         is_bare = pointless and not source.inputs.database
-        clause = "no two of its images have matches that say how they stand to each other"
+        clause = "no two of its images have matches that say where they are relative to each other"
         clause = "it has no 3D points, and no database was given or found" if is_bare else clause
         yield of_model(Kind.UNCHECKED, clause, Grade.CANNOT_BE_JUDGED)
     yield from too_few_to_judge(model.images.num_images)
@@ -342,7 +350,7 @@ def _reasons(state: CheckState) -> Iterator[Reason]:
         yield from _none_agrees(fits, source)
     yield from (one for one in state.weak if not evidence.opinion.confirmed.issuperset(one.images))
     if pointless:
-        clause = "it has no 3D points, so that only matches say where its cameras stand"
+        clause = "it has no 3D points, so that only matches support where its cameras are"
         yield of_model(Kind.POINTS, clause)
     if num_missing := len(source.matches.missing_names):
         clause = f"the database lacks {counted(num_missing, 'image')}: {IS_ITS_DATABASE}"

@@ -1,12 +1,11 @@
-"""`relative_rotations`: those of all pairs of a database's images, by threads or by an executor's workers."""
+"""`relative_rotations`: those of all pairs of a database's images, by threads or by workers of a cluster."""
 
-import itertools
 from collections.abc import Callable
-from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,10 +23,13 @@ from sfm_shapefit.pairs.essential import (
 )
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.execution import measure_with_workers
+from sfm_shapefit.pipeline.execution import measure_with_workers, workers_of
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.scene.matches import RayMatches, View
 from sfm_shapefit.solver.solver_options import SolverOptions
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 # Pairs of each image that are tried for by themselves where there are very many: all lie near their average.
 _FIRST_PAIRS = 5
@@ -50,19 +52,18 @@ def relative_rotations(
     *,
     min_matches: int = LEAST_MATCHES,
     threads: int = 0,
-    executor: Executor | None = None,
+    client: "Client | None" = None,
     progress: Progress | None = None,
 ) -> DatabaseRotations:
     """Return the relative rotation of every pair of a database's images that has one, ascending by pair.
 
-    The answer is the same, to the bit, for any number of threads and any executor.
+    The answer is the same, to the bit, for any number of threads and workers.
 
     Args:
         database: with keypoints and two-view geometries; it is never changed. Intrinsics are the database's.
         min_matches: pairs with fewer inlier matches are left out; at least 1.
         threads: among which the pairs are shared out; 0 for one per core.
-        executor: of `concurrent.futures`; its workers estimate instead, and open the database themselves. It
-            is not shut down.
+        client: of dask.distributed; its workers estimate instead, and open the database themselves.
         progress: called with "relative rotations", the pairs that are done and their number.
 
     Returns:
@@ -72,11 +73,11 @@ def relative_rotations(
     Raises:
         ValueError: if an option has no such value.
         InputError: if the database cannot be used; the message says what to do.
-        WorkerError: if a worker died and the executor does not replace it.
+        WorkerError: if a worker does not see the database, or a task failed again and again.
     """
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
-    clock = Clock.of(progress, SolverOptions(threads=threads).threads, executor)
+    clock = Clock.of(progress, SolverOptions(threads=threads).threads, workers_of(client, database))
     with clock("relative rotations"), closing(DatabaseFile(database)) as file:
         images = read_images(file).images
         view = DatabaseMatches(file, images.names).at(images.apart())
@@ -96,7 +97,7 @@ def measure_rotations(
 
     Raises:
         InputError: if the database cannot be read, or a row of it is damaged.
-        WorkerError: if a worker died and the executor does not replace it.
+        WorkerError: if a worker does not see the database, or a task failed again and again.
     """
     clock = clock or Clock()
     are_many = have_many_pairs(view.images.num_images, view.num_pairs)
@@ -106,7 +107,7 @@ def measure_rotations(
         averaged = average_relative_rotations(view.images.num_images, some, clock.threads)
         known = np.where(averaged.registered[:, None, None], averaged.rotations, np.nan)
         estimate = partial(estimate_near, are_many=are_many, rotations=known)
-    if clock.executor is None:
+    if clock.cluster is None:
         return estimate_here(view, estimate, clock, min_matches)
     parts = measure_with_workers(view, estimate, clock, min_matches, _MATCHES_PER_TASK)
     return concatenate_rotations(parts)
@@ -126,9 +127,9 @@ def estimate_near(
     """
     i, j = batch.pairs.T
     turns = np.nan_to_num(rotations[j] @ rotations[i].transpose(0, 2, 1))
-    rays_i, bounds = np.empty_like(batch.rays_i), itertools.pairwise(batch.offsets.tolist())
-    for (first, last), turn in zip(bounds, turns.transpose(0, 2, 1), strict=True):
-        np.matmul(batch.rays_i[first:last], turn, out=rays_i[first:last])
+    rays_i = np.empty_like(batch.rays_i)
+    for own, turn in zip(batch.slices(), turns.transpose(0, 2, 1), strict=True):
+        np.matmul(batch.rays_i[own], turn, out=rays_i[own])
     in_axes_of_j = replace(batch, rays_i=rays_i)
     baselines = estimate_directions(in_axes_of_j, _NEAR, threads).directions
     likely = LikelyPoses(turns, baselines, np.full(len(batch.pairs), _LIKELY))

@@ -77,7 +77,7 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
         posed = images.part(rows)
         if adjusts:  # which triangulates at the poses of the start itself
             freedom, given = state.freedom_of(rows), state.given_poses(rows)
-            run = begin(posed, links, options.structure, freedom, given, clock.threads)
+            run = begin(posed, links, options.structure, freedom, given, state.crew_of(clock))
             bundle, points = adjust_seed(run)
             posed, images = bundle.images, images.updated(bundle.images)
         else:

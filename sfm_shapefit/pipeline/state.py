@@ -9,10 +9,12 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.executors import Advance
+from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.base.executors import Advance, Crew
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
+from sfm_shapefit.facts.scale_bars import MeasuredBars
 from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -73,6 +75,8 @@ class ModelState:
     bundle: Estimate | None = None
     """How cameras and points were bundle adjusted, if that was asked for."""
     control: tuple[ControlPoint, ...] = ()
+    bars: MeasuredBars | None = None
+    """Scale bars as they are in the output."""
     evidence: ModelEvidence = _LATER
     warnings: tuple[str, ...] = ()
     """What the user should know, a sentence each, from the stages that know it."""
@@ -106,6 +110,11 @@ class ModelState:
     def among(self) -> IntArray | None:
         """The images whose matches are read: of a further piece, which is small, its own; None for all."""
         return self.placement.cameras if self.placement.piece else None
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """The last adjustment; None without one."""
+        return self.bundle or self.adjustment or self.first
 
     @property
     def freedom(self) -> Freedom:
@@ -176,6 +185,10 @@ class ModelState:
         rotations = None if self.adjustment is None else images.frames.rotations
         given = GivenPoses(rotations, self.inputs.fixed_frames, self.held)
         return given.of(np.unique(images.frame_of[rows]))
+
+    def crew_of(self, clock: Clock) -> Crew:
+        """Return who works, and how for memory."""
+        return replace(clock.crew, divides=self.source.memory_plan.divides)
 
     def pictures(self, images: Images, rows: IntArray) -> ModelKeypoints:
         """Return the keypoints of some images (r,), and their lenses."""

@@ -6,8 +6,10 @@ that were joined stand in `joined_0` in one world too.
 """
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,7 +17,7 @@ import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_file, atomic_folder
 from sfm_shapefit.base.display import Reported, Writers
-from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.errors import InputError, ShapeFitError
 from sfm_shapefit.base.paths import file_of, refuse_irregular_file, refuse_no_folder
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
@@ -26,12 +28,19 @@ from sfm_shapefit.facts.placed import IN_MEMORY, folder_of
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import covariances_of, covariances_text, own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, Table, write_rows
+from sfm_shapefit.files.colmap.database import open_database
+from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.files.matching_options import MADE_FIRST, SIDECARS
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.matches import Matches
+from sfm_shapefit.tracks.structure_options import StructureOptions
 
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
+    from sfm_shapefit.report.matched import DrawnMatches
 
 Result = TypeVar("Result", bound=LocateResult | GraphResult | MapResult | JoinedModel)
 
@@ -96,10 +105,10 @@ def deliver(found: Result, out: Path | str, options: WriteOptions) -> Result:
             models = {str(number): model for number, model in enumerate(found.models)}
             for name, one in (models | {joined.folder: joined for joined in found.joined}).items():
                 (folder / name).mkdir()
-                _write_files(one, folder / name, options)
+                _write_files(one, folder / name, Path(out) / name, options)
             write_json(found.summary(), folder / MAP_MARKER)
         else:
-            _write_files(found, folder, options)
+            _write_files(found, folder, Path(out), options)
     return found
 
 
@@ -176,8 +185,9 @@ def _inputs_of(found: Any) -> list[Path]:
 
 
 def _write_files(
-    found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions
+    found: LocateResult | GraphResult | JoinedModel, folder: Path, called: Path, options: WriteOptions
 ) -> None:
+    """Write a result into a folder, which will be `called` otherwise."""
     if isinstance(found, LocateResult):
         write_model(found.model, folder)
     elif isinstance(found, JoinedModel):
@@ -198,7 +208,7 @@ def _write_files(
         write_rows(found.doubtful_pairs, folder / "doubtful_pairs.csv")
     write_json(found.facts.summary(), folder / MARKER)
     if options.report:
-        _write_report(found, folder / "report.html", options.images)
+        _write_report(found, folder / "report.html", options.images, str(called))
 
 
 def _write_cameras(rows: Table[CameraRow], folder: Path) -> None:
@@ -288,17 +298,47 @@ def _drawing_of(found: Any) -> "Drawing":
     return drawing
 
 
-def _write_report(found: Any, page: Path, images: Path | str) -> bool:
+def _write_report(found: Any, page: Path, images: Path | str, out: str = "OUT") -> bool:
     """Write a report, of several models that of the largest; False if pictures were asked for in vain."""
-    from sfm_shapefit.report.page import write_report
+    from sfm_shapefit.report.page import Occasion, Pictures, write_report
     from sfm_shapefit.report.thumbnails import read_thumbnails
 
     shown = found.models[0] if isinstance(found, MapResult) else found
     drawing = _drawing_of(shown)
-    cameras = drawing.cameras
-    pictures = read_thumbnails(Path(images), cameras.names, cameras.trust) if str(images) else None
-    write_report(drawing, shown.facts, page, pictures, images)
-    return pictures is None or bool(pictures)
+    occasion = Occasion(out, day=date.today().isoformat())
+    if not str(images):
+        write_report(drawing, shown.facts, page, occasion=occasion)
+        return True
+    small = read_thumbnails(Path(images), drawing.cameras.names, drawing.cameras.trust)
+    pictures = Pictures(small, _matches_between(shown, drawing, small)) if small else None
+    occasion = occasion._replace(images=str(images)) if small else occasion
+    write_report(drawing, shown.facts, page, pictures, occasion)
+    return bool(small)
+
+
+def _matches_between(found: Any, drawing: "Drawing", pictures: Collection[int]) -> "DrawnMatches | None":
+    """Return the matches between pictures, of the database or else of the model's points.
+
+    None where there are none, or the database cannot be read any more.
+    """
+    from sfm_shapefit.report.matched import pick_matches
+
+    if isinstance(found, GraphResult):
+        return None
+    with suppress(ShapeFitError), ExitStack() as stack:
+        database = found.facts.inputs.database
+        if database and isinstance(found, LocateResult):
+            images: Images = found.placed
+            matches: Matches = open_database(database, images.names)
+        else:
+            model = read_model(found)
+            images = model.images
+            matches = open_database(database, images.names) if database else TrackMatches(model)
+        stack.callback(matches.close)
+        structure = found.options.structure if isinstance(found, LocateResult) else StructureOptions()
+        limit_px = structure.max_reprojection_error_px
+        return pick_matches(drawing.cameras, drawing.pairs, matches.at(images), pictures, limit_px)
+    return None
 
 
 WRITERS = Writers(_draw_page, write_page, write_result)

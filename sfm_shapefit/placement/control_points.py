@@ -18,11 +18,13 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose, fit_similarity, principal_lengths
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.placement.gauge import Free, Gauge, fit_to_priors
 from sfm_shapefit.scene.given import (
     FEWEST_CONTROL_POINTS,
     ControlPoints,
     MarkedViews,
+    Marks,
     PositionPriors,
     why_too_few,
 )
@@ -37,8 +39,8 @@ _MOST_ROUNDS = 20  # rounds, a bound; who fits settles in fewer
 _FLAT = 5.0  # standard deviations; a smaller spread across a line leaves the turn about the line open
 
 
-class TriangulatedControl(NamedTuple):
-    """Where a model has control points, and how well their marks agree."""
+class TriangulatedMarks(NamedTuple):
+    """Where a model has points that are marked in its images, and how well their marks agree."""
 
     positions: FloatArray
     """(k, 3), NaN for those that cannot be triangulated."""
@@ -64,13 +66,11 @@ class ControlFit(NamedTuple):
     """Relative standard deviation of the scale."""
 
 
-def triangulate_control_points(
-    control: ControlPoints, seen: MarkedViews, options: StructureOptions
-) -> TriangulatedControl:
-    """Return where the placed images have control points; marks may be wrong, or off by 4 keypoint errors."""
+def triangulate_marks(control: Marks, seen: MarkedViews, options: StructureOptions) -> TriangulatedMarks:
+    """Return where the placed images have points; marks may be wrong, or off by 4 keypoint errors."""
     counts = np.bincount(control.points[seen.rows], minlength=len(control.names))
     tracks = ObservedTracks(
-        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        offsets=offsets_of(counts),
         cameras=np.arange(len(seen.rows)),
         keypoints=seen.rows,
         pixels=control.pixels[seen.rows],
@@ -99,7 +99,7 @@ def triangulate_control_points(
     with np.errstate(invalid="ignore", divide="ignore"):
         off = np.linalg.norm(inside[:, :2] / inside[:, 2:] - seen.on_plane, axis=1)
         errors[seen.rows] = seen.focal_lengths_px * off
-    return TriangulatedControl(positions, errors, agreeing)
+    return TriangulatedMarks(positions, errors, agreeing)
 
 
 def fit_control_points(

@@ -31,7 +31,7 @@ _ROUGH = 0.1  # spreads; the scale is rough if the input's centers are off by mo
 _DOUBTFUL = 0.01  # spreads; priors that are off by more are tried in other readings
 _MEANINGLESS = 0.5  # spreads; random positions are .6 off
 _COINCIDENT = 1e-9  # share of the distance from the origin; a smaller spread of centers is rounding
-ScaleKind = Literal["fixed", "rig", "control points", "distance", "prior", "input", "unit"]
+ScaleKind = Literal["fixed", "rig", "control points", "scale bars", "distance", "prior", "input", "unit"]
 """What can set a scale, by precedence."""
 FEWEST_PRIORS = 2  # positions; with fewer there is no scale
 FEWEST_CHECKED = 5
@@ -113,7 +113,7 @@ def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
             f"the input's centers are {off:.0%} of their spread off the answer, so the scale taken from them "
             "is rough; give scale=unit if they mean nothing"
         )
-    statement = "input: scale and origin of the input's centers, its axes"
+    statement = "input: scale, origin and axes are the input's"
     return Gauge(similarity=similarity, scale="input", statement=statement, warning=warning)
 
 

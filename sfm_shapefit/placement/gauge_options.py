@@ -17,7 +17,7 @@ class GaugeOptions(Settings):
     scale: Scale = option(
         "auto",
         "Scale and origin of the output, unless known positions or distances set them. What does, in this "
-        "order: fixed cameras, rigs, control points, known distances, priors; others are checks. "
+        "order: fixed cameras, rigs, control points, scale bars, known distances, priors; others are checks. "
         '"input" takes those of the input\'s centers; "unit" puts the centroid at 0 and the median distance '
         'from it at 1; "auto" is "input", or "unit" where the input has no centers.',
     )
@@ -30,6 +30,11 @@ class GaugeOptions(Settings):
         "",
         "Ground control points, which set scale, origin and axes: a gcp_list.txt as of OpenDroneMap, whose "
         "first line names the projection, and whose others are x y z, pixels, image, name of the point.",
+    )
+    scale_bars: str = option(
+        "",
+        "Known lengths between points that images show, which set the scale: a file whose lines are a "
+        "length, its standard deviation, pixels, image, name of the bar, and of the end marked there.",
     )
 
     def __post_init__(self) -> None:

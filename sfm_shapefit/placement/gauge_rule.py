@@ -1,6 +1,7 @@
 """What sets scale, origin and axes of the output, by precedence, and what checks them."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.geometry import Similarity, compose
 from sfm_shapefit.base.wording import counted_are
 from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged
 from sfm_shapefit.placement.gauge import (
@@ -31,6 +33,7 @@ SETS_SCALE: dict[ScaleKind, str] = {
     "fixed": "the fixed cameras",
     "rig": "the rigs",
     "control points": "the control points",
+    "scale bars": "the scale bars",
     "distance": "the known distances",
     "prior": "the position priors",
     "input": "the input",
@@ -128,6 +131,28 @@ def gauge_of_distances(names: Sequence[str], locations: FloatArray, known: Seque
     clauses = [f"{first} and {second}" for first, second, _ in distances]
     return distance_gauge(
         locations, places, np.array([float(distance) for *_, distance in distances]), clauses
+    )
+
+
+def resized_gauge(
+    before: Gauge, middle: FloatArray, scale: float, sigma: float, statement: str
+) -> tuple[Similarity, Gauge]:
+    """Return the motion that gives a model another scale, its middle (3,) where it is, and the gauge then.
+
+    The scale is that of scale bars, and known to `sigma` of itself.
+    """
+    motion = Similarity(scale=scale, rotation=np.eye(3), translation=(1.0 - scale) * middle)
+    axes = np.eye(3) if before.axes is None else before.axes
+    rest = f"origin and axes: those of {SETS_SCALE[before.scale]}"
+    if before.scale in ("unit", "distance"):
+        rest = "origin: the cameras' centroid, axes: the input's"
+    return motion, replace(
+        before,
+        similarity=compose(replace(motion, translation=axes.T @ motion.translation), before.similarity),
+        scale="scale bars",
+        statement=f"{statement}; {rest}",
+        scale_statement=statement,
+        scale_sigma=sigma,
     )
 
 

@@ -18,6 +18,8 @@ class MemoryPlan:
     """What that is, for the user; empty for nothing."""
     reading: Reading = PLENTY
     """How matches are read."""
+    divides: bool = False
+    """Whether adjustments are divided, see `adjustment.divided`."""
     samples: bool = True
     """Whether the errors of directions are sampled together where keypoints are shared."""
     points: bool = True
@@ -41,6 +43,7 @@ def _list_memory_plans() -> Iterator[MemoryPlan]:
     given_up: list[str] = []
     for what, changes in (
         ("matches are read in small batches", {"reading": _FRUGAL}),
+        ("adjustments go part by part", {"divides": True}),
         ("directions count as independent in standard deviations", {"samples": False}),
         ("no 3D points join the view graph", {"points": False}),
         ("cameras are not adjusted by their matches", {"adjustment": False}),

@@ -14,13 +14,16 @@ as good as the turns, so that a robust refinement moves all seven unknowns, its 
 in steps.
 """
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import Similarity, normalized
+from sfm_shapefit.base.geometry import Similarity
+from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.losses import CAUCHY, loss, weighed
 from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.base.wording import counted
@@ -37,8 +40,13 @@ _LEAST_LENGTH = 1e-6  # share of the median; ends that nearly coincide would hav
 _SCALES_PX = (32.0, 8.0, 2.0)  # pixels; a turn off by half a degree is 13 to 29 of them
 _STEPS = 10  # Gauss-Newton steps at each scale; most scales settle in fewer
 _SETTLED = 1e-5  # share of the cost; steps that lower it by less end a scale
+# Shares of the diagonal; a refused step is a matter of the loss, and far less of it helps.
+_DAMPING = DampingRange(first=1e-6, least=0.0, most=1.0, growth=100.0)
 _SHIFT = 1e-6  # step of an unknown that tells its derivative; larger ones bend, smaller ones are rounding
+_TINY = float(np.finfo(np.float64).tiny)
 _EFFECTIVE = 10.0  # matches that count of a pair; its errors are common to all of them
+
+_Linearized = tuple[float, FloatArray, FloatArray]
 
 
 class Standing(NamedTuple):
@@ -169,7 +177,11 @@ def _halved(weights: FloatArray, first: int) -> FloatArray:
 
 
 class Residuals(NamedTuple):
-    """Residuals of k rows, each between two pieces, in pixels."""
+    """What k residuals are of, each between two pieces, and in pixels.
+
+    With a point, the unit vector to it less the ray; else the first entry alone, the volume of both rays and
+    the line between the centers over the smaller of its planes.
+    """
 
     pieces: IntArray
     """(k, 2)"""
@@ -185,28 +197,6 @@ class Residuals(NamedTuple):
     """(k, 3) in the second piece, the other camera's unit ray; NaN where the target is a point."""
     pixel_angles: FloatArray
     """(k,)"""
-
-    def at(self, first: Standing, second: Standing) -> FloatArray:
-        """Return them, (k, 3), for the pieces of each row standing as given, a row each."""
-        eyes, targets = _stand(first, self.eyes), _stand(second, self.targets)
-        looks = np.einsum("rkl,rl->rk", first.turns, self.looks)
-        across = normalized(targets - eyes)
-        off = across - looks
-        rows = np.flatnonzero(np.isfinite(self.other_looks[:, 0]))
-        if not len(rows):
-            return np.asarray(off / self.pixel_angles[:, None])
-        others = np.einsum("rkl,rl->rk", second.turns[rows], self.other_looks[rows])
-        planes = [np.linalg.norm(np.cross(across[rows], one), axis=1) for one in (looks[rows], others)]
-        volume = np.vecdot(np.cross(looks[rows], others), across[rows])
-        off[rows] = 0.0
-        off[rows, 0] = volume / np.maximum(np.minimum(*planes), 1e-12)
-        return np.asarray(off / self.pixel_angles[:, None])
-
-
-def _stand(standing: Standing, places: FloatArray) -> FloatArray:
-    """Return where places (k, 3) come to lie, each in a piece of its own that stands as given."""
-    turned = np.einsum("rkl,rl->rk", standing.turns, places)
-    return np.asarray(standing.scales[:, None] * turned + standing.middles)
 
 
 def residuals_of(cameras: PieceCameras, ties: PieceTies) -> Residuals:
@@ -237,8 +227,9 @@ def residuals_of(cameras: PieceCameras, ties: PieceTies) -> Residuals:
 
 def misses_px(residuals: Residuals, standing: Standing) -> FloatArray:
     """Return the sizes of residuals, (k,)."""
-    first, second = (Standing(*(part[ends] for part in standing)) for ends in residuals.pieces.T)
-    return np.asarray(np.linalg.norm(residuals.at(first, second), axis=1))
+    found = np.empty((len(residuals.pairs), 3))
+    _measure(residuals, standing, found)
+    return np.asarray(np.linalg.norm(found, axis=1))
 
 
 def refine_pieces(cameras: PieceCameras, ties: PieceTies, standing: Standing) -> tuple[Standing, FloatArray]:
@@ -254,26 +245,34 @@ def refine_pieces(cameras: PieceCameras, ties: PieceTies, standing: Standing) ->
     held = np.zeros((len(sizes), 7), dtype=np.bool_)
     held[0] = True
     held[:, 3] |= ~free
-    hessian = np.zeros((7 * len(sizes), 7 * len(sizes)))
     for scale in _SCALES_PX:
-        damping = 1e-6
-        cost, hessian, slope = _linearize(residuals, standing, sizes, weights, scale)
+        system, damping = _linearize(residuals, standing, sizes, weights, scale), _DAMPING.first
         for _ in range(_STEPS):
-            moved = _moved(standing, -_solve(hessian, slope, held.ravel(), damping), sizes)
-            then = _linearize(residuals, moved, sizes, weights, scale)
-            if not then[0] < cost:
-                damping *= 100.0
-                if damping > 1.0:
-                    break
-                continue
-            settled = cost - then[0] < _SETTLED * cost
-            standing, (cost, hessian, slope), damping = moved, then, damping / 10.0
-            if settled:
+            propose = partial(_propose, (residuals, sizes, weights, scale), standing, system, held.ravel())
+            moved, damping = take_damped_step(propose, damping, _DAMPING)
+            if moved is None:
+                break
+            before, (standing, system) = system[0], moved
+            if before - system[0] < _SETTLED * before:
                 break
     _, hessian, _ = _linearize(
         residuals, standing, sizes, np.minimum(_EFFECTIVE / counts, 1.0), _SCALES_PX[-1]
     )
     return standing, _covariances(hessian, held)
+
+
+def _propose(
+    problem: tuple[Residuals, FloatArray, FloatArray, float],
+    standing: Standing,
+    system: _Linearized,
+    held: BoolArray,
+    damping: float,
+) -> tuple[Standing, _Linearized] | None:
+    """Return where a damped step leads, and what `_linearize` says there; None if the cost is not lower."""
+    residuals, sizes, weights, scale = problem
+    moved = _moved(standing, -_solve(*system[1:], held, damping), sizes)
+    then = _linearize(residuals, moved, sizes, weights, scale)
+    return (moved, then) if then[0] < system[0] else None
 
 
 def _solve(hessian: FloatArray, slope: FloatArray, held: BoolArray, damping: float) -> FloatArray:
@@ -309,28 +308,96 @@ def _moved(standing: Standing, step: FloatArray, sizes: FloatArray) -> Standing:
 
 def _linearize(
     residuals: Residuals, standing: Standing, sizes: FloatArray, weights: FloatArray, scale: float
-) -> tuple[float, FloatArray, FloatArray]:
+) -> _Linearized:
     """Return the Cauchy cost, and Hessian (7 G, 7 G) and slope (7 G,) of its reweighted squares."""
-    first, second = (Standing(*(part[ends] for part in standing)) for ends in residuals.pieces.T)
-    now = residuals.at(first, second)
-    squares = np.sum(now**2, axis=1) / scale**2
-    cost = float(weights @ loss(CAUCHY, squares)) * scale**2
-    robust = weighed(CAUCHY, weights, squares)
-    num_unknowns = 7 * len(sizes)
-    columns = np.empty((len(now), 3, 14))
-    for k in range(7):
-        for end, own in enumerate((first, second)):
-            step = np.zeros((len(now), 7))
-            step[:, k] = _SHIFT
-            moved = _moved(own, step.ravel(), sizes[residuals.pieces[:, end]])
-            ends = (moved, second) if end == 0 else (first, moved)
-            columns[:, :, 7 * end + k] = (residuals.at(*ends) - now) / _SHIFT
+    count, num_unknowns = len(sizes), 7 * len(sizes)
+    steps = np.repeat(np.vstack([np.zeros(7), _SHIFT * np.eye(7)]), count, axis=0)  # (8 G, 7)
+    moved = _moved(Standing(*(np.concatenate(8 * [part]) for part in standing)), steps, np.tile(sizes, 8))
+    pieces, index = np.unique(residuals.pieces, axis=0, return_inverse=True)
+    blocks, slopes = np.zeros((len(pieces), 14, 14)), np.zeros((len(pieces), 14))
+    cost = _sum_squares(residuals, moved, index.ravel(), weights, scale, (blocks, slopes))
     hessian, slope = np.zeros((num_unknowns, num_unknowns)), np.zeros(num_unknowns)
-    for two in np.unique(residuals.pieces, axis=0):
-        rows = (residuals.pieces == two).all(axis=1)
+    for two, block, own in zip(pieces, blocks, slopes, strict=True):
         places = (7 * two[:, None] + np.arange(7)).ravel()
-        part = columns[rows].reshape(-1, 14)
-        weighted = np.repeat(robust[rows], 3)[:, None] * part
-        hessian[np.ix_(places, places)] += weighted.T @ part
-        slope[places] += weighted.T @ now[rows].ravel()
-    return cost, hessian, slope
+        hessian[np.ix_(places, places)] += block + np.tril(block, -1).T
+        slope[places] += own
+    return float(cost) * scale**2, hessian, slope
+
+
+@kernel
+def _measure(residuals: Any, standing: Any, out: Any) -> None:
+    """Write the residuals (k, 3) of pieces that stand as given (G,)."""
+    for row in range(len(out)):
+        _residual(row, residuals, standing, residuals.pieces[row, 0], residuals.pieces[row, 1], out[row])
+
+
+@kernel
+def _sum_squares(residuals: Any, moved: Any, index: Any, weights: Any, scale: float, sums: Any) -> float:
+    """Return the Cauchy cost over scale^2, and add up its blocks (P, 14, 14), lower half, and slopes.
+
+    Args:
+        residuals, weights: (k,)
+        moved: (8 G,) the pieces as they stand, then with each unknown in turn moved by `_SHIFT`.
+        index: (k,) the pair of pieces of each residual, of P.
+        scale: see `refine_pieces`.
+        sums: the blocks and the slopes (P, 14).
+    """
+    (blocks, slopes), total, count = sums, 0.0, len(moved.scales) // 8
+    now, there, columns = np.empty(3), np.empty(3), np.empty((3, 14))
+    for row in range(len(index)):
+        i, j, p = residuals.pieces[row, 0], residuals.pieces[row, 1], index[row]
+        _residual(row, residuals, moved, i, j, now)
+        square = (now[0] ** 2 + now[1] ** 2 + now[2] ** 2) / scale**2
+        total += weights[row] * loss(CAUCHY, square)
+        weight = weighed(CAUCHY, weights[row], square)
+        used = 1 if np.isfinite(residuals.other_looks[row, 0]) else 3
+        for k in range(14):
+            step = count * (k % 7 + 1)
+            first, second = (i + step, j) if k < 7 else (i, j + step)
+            _residual(row, residuals, moved, first, second, there)
+            for a in range(used):
+                columns[a, k] = (there[a] - now[a]) / _SHIFT
+        for a in range(used):
+            for k in range(14):
+                pull = weight * columns[a, k]
+                slopes[p, k] += pull * now[a]
+                for other in range(k + 1):
+                    blocks[p, k, other] += pull * columns[a, other]
+    return total
+
+
+@inner_kernel
+def _residual(row: int, residuals: Any, standing: Any, first: int, second: int, out: Any) -> None:
+    """Write one residual (3,) where its pieces stand as two entries of `standing` say."""
+    turn, other_turn = standing.turns[first], standing.turns[second]
+    has_point = not np.isfinite(residuals.other_looks[row, 0])
+    square = 0.0
+    for a in range(3):
+        eye, target = 0.0, 0.0
+        for b in range(3):
+            eye += turn[a, b] * residuals.eyes[row, b]
+            target += other_turn[a, b] * residuals.targets[row, b]
+        out[a] = standing.scales[second] * target + standing.middles[second, a]
+        out[a] -= standing.scales[first] * eye + standing.middles[first, a]
+        square += out[a] ** 2
+    length = max(np.sqrt(square), _TINY)
+    x, y, z = out[0] / length, out[1] / length, out[2] / length
+    u, v, w = _turned(turn, residuals.looks[row])
+    pixel = residuals.pixel_angles[row]
+    if has_point:
+        out[0], out[1], out[2] = (x - u) / pixel, (y - v) / pixel, (z - w) / pixel
+        return
+    p, q, r = _turned(other_turn, residuals.other_looks[row])
+    plane = (y * w - z * v) ** 2 + (z * u - x * w) ** 2 + (x * v - y * u) ** 2
+    other = (y * r - z * q) ** 2 + (z * p - x * r) ** 2 + (x * q - y * p) ** 2
+    volume = (v * r - w * q) * x + (w * p - u * r) * y + (u * q - v * p) * z
+    out[0], out[1], out[2] = volume / max(np.sqrt(min(plane, other)), 1e-12) / pixel, 0.0, 0.0
+
+
+@inner_kernel
+def _turned(turn: Any, x: Any) -> tuple[float, float, float]:
+    return (
+        turn[0, 0] * x[0] + turn[0, 1] * x[1] + turn[0, 2] * x[2],
+        turn[1, 0] * x[0] + turn[1, 1] * x[1] + turn[1, 2] * x[2],
+        turn[2, 0] * x[0] + turn[2, 1] * x[1] + turn[2, 2] * x[2],
+    )

@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_of_parts
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import mean_rotation_l1, median_spread, nearest_rotations, rotation_angles_deg
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
@@ -98,7 +99,7 @@ class PieceTies:
     def subset(self, pairs: IntArray | BoolArray) -> "PieceTies":
         """Return some of the pairs."""
         chosen = np.arange(self.num_pairs)[pairs]
-        rows = rows_of_parts(self.matches.offsets, chosen)[1]
+        rows = self.matches.rows_of(chosen).rows
         return PieceTies(
             matches=self.matches.rays_of(chosen), points=self.points[rows], is_shared=self.is_shared[chosen]
         )
@@ -109,17 +110,14 @@ class PieceTies:
 
     def split(self) -> "tuple[PieceTies, PieceTies]":
         """Return the matches to place pieces by, and every fifth of a pair's, which are set aside."""
-        place = np.arange(len(self.points)) - np.repeat(
-            self.matches.offsets[:-1], np.diff(self.matches.offsets)
-        )
-        aside = place % _SET_ASIDE == _SET_ASIDE - 1
+        aside = self.matches.ranks() % _SET_ASIDE == _SET_ASIDE - 1
         return self._of_matches(~aside), self._of_matches(aside)
 
     def _of_matches(self, kept: BoolArray) -> "PieceTies":
         counts = np.bincount(self.pair_of[kept], minlength=self.num_pairs)
         matches = replace(
             self.matches,
-            offsets=np.append(0, np.cumsum(counts)),
+            offsets=offsets_of(counts),
             rays_i=self.matches.rays_i[kept],
             rays_j=self.matches.rays_j[kept],
         )

@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread, tangent_bases
 from sfm_shapefit.base.jit import inner_kernel, kernel
@@ -45,7 +46,6 @@ from sfm_shapefit.laplacian.factor import (
     analyze,
 )
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
-from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
 from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor, predict_factor
 
@@ -108,6 +108,7 @@ def refine_angles(
     start: FloatArray,
     plan: FactorPlan | LaplacianFactor,
     other: FloatArray | None = None,
+    threads: int = 1,
 ) -> AngularResult:
     """Refine locations by robust Levenberg-Marquardt in the angles of the directions.
 
@@ -121,9 +122,10 @@ def refine_angles(
             locations are and stay those of the groups.
         other: (n, d) refined locations of the other start; once the levels have settled, the refinement ends
             where it has come as low as these, and where it clearly cannot.
+        threads: of the factor, if `plan` is one's plan.
     """
     graph, classes = measured.graph, measured.classes
-    factor, spread = allocate_normal(plan, graph.dimension), _spread(measured)
+    factor, spread = allocate_normal(plan, graph.dimension, threads), _spread(measured)
     first = unit_norm(start)
     other = None if other is None else unit_norm(other)
     t, damping, steps = first, DAMPING.first, 0
@@ -197,9 +199,9 @@ class AngularTerms:
         return baselines, graph.directions, graph.weights, self._information, floor, self._kind
 
 
-def allocate_normal(plan: FactorPlan | LaplacianFactor, dimension: int) -> LaplacianFactor:
+def allocate_normal(plan: FactorPlan | LaplacianFactor, dimension: int, threads: int = 1) -> LaplacianFactor:
     """Return memory for a factor of what `plan_refinement` says."""
-    return allocate_factor(plan, dimension) if isinstance(plan, FactorPlan) else plan
+    return allocate_factor(plan, dimension, threads=threads) if isinstance(plan, FactorPlan) else plan
 
 
 def take_angular_step(

@@ -46,20 +46,22 @@ al., "Graduated non-convexity for robust spatial perception", RA-L 2020. The pri
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import tangent_bases
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.scipy_parts import gammaln, logit
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.laplacian.factor import FactorPlan, allocate_factor
+from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.refinement.length_prior import LengthPrior
-from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
 
 _LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
@@ -82,6 +84,7 @@ _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; abov
 _DAMPING = DampingRange(1e-3, 1e-10, 1e2)  # shares of the median information; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
 _LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.003  # nats; a smaller change of the bound is none
+_CHUNK = 8192  # directions; what they add to sums is added up in this order, whatever the threads
 _SMALL_STEP = 1e-3  # nats that a step promises; below, it is taken unseen, since rounding may hide the gain
 _MET = 0.1  # levels; a descent that has all baselines of another, so closely, ends where that did
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
@@ -189,8 +192,8 @@ class _System(NamedTuple):
 class Mixture:
     """The mixture model of a connected graph of cameras that move one by one."""
 
-    def __init__(self, measured: MeasuredGraph, plan: FactorPlan) -> None:
-        """Take a graph and the plan of its factor."""
+    def __init__(self, measured: MeasuredGraph, plan: FactorPlan, threads: int = 1) -> None:
+        """Take a graph and the plan of its factor, whose work so many threads share."""
         graph = self._graph = measured.graph
         d, bases = graph.dimension, tangent_bases(graph.directions)
         self._own, self._axes = np.zeros((graph.num_edges, d - 1)), bases
@@ -202,7 +205,9 @@ class Mixture:
                 self._own[~known[:, 0, 0]] = np.median(self._own[known[:, 0, 0]])
         log_sphere = np.log(2.0) + 0.5 * d * np.log(np.pi) - gammaln(0.5 * d)
         self._peak = float(np.exp(log_sphere - 0.5 * (d - 1) * np.log(2.0 * np.pi)))
-        self._factor = allocate_factor(plan, d)
+        self._factor = allocate_factor(plan, d, threads=threads)
+        self._workers, m = Workers(threads), graph.num_edges
+        self._chunks = [slice(k, k + _CHUNK) for k in range(0, m, _CHUNK)]
         self._least_gain = max(_LEAST_GAIN, _LEAST_GAIN_A_CAMERA * graph.num_nodes)
         self._descents: list[_Descent] = []
         self._lengths = LengthPrior(graph)
@@ -353,10 +358,20 @@ class Mixture:
         """Return what squared errors expected along the axes, (m, d - 1), say under some levels."""
         information, likelihood = np.empty_like(expected), np.empty(len(expected))
         weights = np.r_[1.0 - levels.right, levels.right * self._peak * _NODE_SHARES]
-        sums, levels2 = np.zeros_like(weights), levels.at_nodes(floor) ** 2
-        found = _Expectation(information, likelihood, sums)
-        _expect(expected, self._own if own is None else own, levels2, weights, found)
-        return found
+        levels2, own = levels.at_nodes(floor) ** 2, self._own if own is None else own
+        sums = np.zeros((len(self._chunks), len(weights)))
+
+        def job(k: int, of: slice) -> None:
+            _expect(
+                expected[of],
+                own[of],
+                levels2,
+                weights,
+                _Expectation(information[of], likelihood[of], sums[k]),
+            )
+
+        self._workers.run([partial(job, k, of) for k, of in enumerate(self._chunks)])
+        return _Expectation(information, likelihood, sums.sum(axis=0))
 
     def _fit(
         self, expected: FloatArray, levels: Levels, floor: float, own: FloatArray
@@ -423,7 +438,13 @@ class Mixture:
     def _equations(self, at: _Residuals, precision: float, found: _Expectation) -> _System:
         m, d = at.units.shape
         blocks, gradient = np.empty((m, d, d)), np.empty((m, d))
-        _assemble(at, found.information, precision, _excess_logs(at.lengths), blocks, gradient)
+        excess = _excess_logs(at.lengths)
+
+        def job(of: slice) -> None:
+            part = _Residuals(at.locations, at.lengths[of], at.units[of], at.across[of], at.errors[of])
+            _assemble(part, found.information[of], precision, excess[of], blocks[of], gradient[of])
+
+        self._workers.run([partial(job, of) for of in self._chunks])
         return _System(
             blocks=blocks,
             gradient=gradient,
@@ -450,7 +471,12 @@ class Mixture:
     def _propagate(self, at: _Residuals) -> FloatArray:
         """Return the variance of each residual by that of the locations, (m, d - 1), rad^2."""
         inverse, variances = self._factor.selected_inverse(self._graph.edges), np.empty_like(self._own)
-        _project((inverse.nodes, inverse.edges), self._graph.edges, at.across, at.lengths, variances)
+        edges, nodes = self._graph.edges, inverse.nodes
+
+        def job(of: slice) -> None:
+            _project((nodes, inverse.edges[of]), edges[of], at.across[of], at.lengths[of], variances[of])
+
+        self._workers.run([partial(job, of) for of in self._chunks])
         return np.asarray(np.clip(variances, 0.0, _LARGEST_VARIANCE))
 
     def _put_by_consensus(self, end: MixtureEnd) -> FloatArray:

@@ -10,7 +10,10 @@ likelihood ratio, right against random, for signed unit sides a, b, c around it 
 
 z = sqrt(det Gram(a, b, c)) / R, by how much they leave a plane, R^2 the sum of the squared sines of their
 angles (the noise of all three sides, propagated), gap the angle by which they fail to close in the plane, and
-d the dimension. For finite tau R^2 grows by 6 tau^2. N makes the mean of rho over random triangles 1.
+d the dimension. For finite tau R^2 grows by 6 tau^2. N makes the mean of rho over random triangles 1. In
+space or more, random triangles of a dimension d have a density of Gram matrices of det^((d - 4) / 2), so that
+those of space, weighed by (z R)^(d - 3), stand for them: hardly any that is drawn in many dimensions closes.
+Powers of d are taken in logarithms.
 
 Noise level and share of right triangles are read off the histogram of all triangles: expectation maximization
 for the shares of levels from .005 to .2. The fitted mixture is the likelihood ratio; there is nothing to
@@ -37,7 +40,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.jit import inner_kernel, kernel, mix_bits
-from sfm_shapefit.base.scipy_parts import expit, logit
+from sfm_shapefit.base.scipy_parts import expit, gammaln, logit, xlogy
 from sfm_shapefit.graph.viewgraph import ViewGraph
 
 _LEVELS_RAD = (0.2, 0.13, 0.085, 0.055, 0.036, 0.024, 0.016, 0.011, 0.0075, 0.005)
@@ -52,6 +55,8 @@ _TRIANGLES_WORTH_THREADS = 20_000  # triangles; a sweep over fewer is done befor
 _FIT_TRIANGLES = 100_000  # triangles that the histogram is fitted to; more change no third digit
 _FIT_ROUNDS = 60  # rounds of expectation maximization; shares of neighboring levels part slowly
 _RANDOM_TRIANGLES = 50_000  # triangles that normalize the ratio; it is good to 10 % at the last level
+_SPACE = 3  # dimensions; random triangles are drawn in no more, see the header
+_LARGEST_LOG_RATIO = 300.0  # nats; no float holds the ratio of an exact triangle in many dimensions
 _PRIORS = (0.05, 0.95)  # least and largest share of right pairs; at 0 and 1 messages would be ignored
 
 
@@ -147,17 +152,37 @@ def _shapes(products: FloatArray) -> _Shapes:
 
 def _ratio(shapes: _Shapes, tau: float, dimension: int) -> FloatArray:
     """Return rho(tau) of triangles, (k,), but for its normalizer."""
+    more = max(dimension - _SPACE, 0)
+    return _weighed_ratio(shapes, tau, dimension, _log_mean_power(more))
+
+
+def _weighed_ratio(
+    shapes: _Shapes, tau: float, dimension: int, log_weights: FloatArray | float
+) -> FloatArray:
+    """Return rho(tau) of triangles times weights, (k,), but for a factor that is one for all triangles."""
+    more = max(dimension - _SPACE, 0)
     spread = shapes.sines + 6.0 * tau**2
     exponent = shapes.off_plane**2 / (2.0 * tau**2 * spread) + shapes.gap**2 / (4.0 * tau**2)
-    return np.asarray(spread ** (0.5 * (2 - dimension)) * np.exp(-exponent))
+    # The largest value of off_plane^more exp(-exponent), so that a mean of these is a number.
+    peak = 0.5 * (xlogy(more, more) - more + xlogy(more, tau**2 * spread))
+    logs = np.minimum(log_weights - exponent - peak, _LARGEST_LOG_RATIO)
+    return np.asarray(spread ** (0.5 * (2 - min(dimension, _SPACE))) * np.exp(logs))
+
+
+def _log_mean_power(more: int) -> float:
+    """Return the logarithm of the mean of (z R)^more over random triangles of space, a product of sines."""
+    sines = [gammaln(0.5 * (p + 1)) - gammaln(0.5 * p + 1.0) for p in (more + 1, 1, more, 0)]
+    return float(2.0 * (sines[0] - sines[1]) + sines[2] - sines[3])
 
 
 def _normalizers(dimension: int) -> FloatArray:
     """Return what makes the mean of rho over random triangles 1, for each rung."""
-    sides = np.random.default_rng(0).standard_normal((3, _RANDOM_TRIANGLES, dimension))
+    drawn = min(dimension, _SPACE)
+    sides = np.random.default_rng(0).standard_normal((3, _RANDOM_TRIANGLES, drawn))
     a, b, c = sides / np.linalg.norm(sides, axis=2, keepdims=True)
     shapes = _shapes(np.stack([np.sum(x * y, axis=1) for x, y in ((a, b), (b, c), (c, a))], axis=1))
-    return np.array([1.0 / np.mean(_ratio(shapes, tau, dimension)) for tau in _RUNGS_RAD])
+    weights = xlogy(dimension - drawn, shapes.off_plane)
+    return np.array([1.0 / np.mean(_weighed_ratio(shapes, tau, dimension, weights)) for tau in _RUNGS_RAD])
 
 
 def _fit_shares(shapes: _Shapes, dimension: int, norms: FloatArray) -> FloatArray:

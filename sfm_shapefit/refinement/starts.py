@@ -174,6 +174,7 @@ class _Problem(NamedTuple):
     """(n, d) LUD's."""
     apart: float | None
     """See `RefinedPlacement.disagreement`."""
+    threads: int
 
 
 def refine_starts(
@@ -192,7 +193,8 @@ def refine_starts(
     lud, second = _find_second_start(measured, options.solver.num_threads(), certified)
     apart = None if second is None else disagreement(graph, solved.locations, second)
     normal_solver = _plan_normal_solver(measured, options) if options.refines else None
-    problem = _Problem(measured, normal_solver, solved.locations, second, apart)
+    threads = options.solver.num_threads()
+    problem = _Problem(measured, normal_solver, solved.locations, second, apart, threads)
     kept = _find_most_evident(problem, options) or _find_best_fit(problem, options)
     moved = _measure_moves(kept.start)
     # To the bit: the certificate is that of these very locations.
@@ -287,7 +289,7 @@ def _find_most_evident(problem: _Problem, options: PlacementOptions) -> _Kept | 
         return None
     if not isinstance(plan, FactorPlan):
         return None
-    model = Mixture(measured, plan)
+    model = Mixture(measured, plan, options.solver.num_threads())
     candidates = _descend_from_starts(model, problem, options)
     if not candidates:
         return None
@@ -420,7 +422,8 @@ def _reweight(
 
     def refine(graph: ViewGraph, locations: FloatArray, fallback: FloatArray) -> AngularResult:
         weighted = replace(measured, graph=graph)
-        return _reset_strays(weighted, fallback, refine_angles(weighted, locations, solver))[0]
+        refined = refine_angles(weighted, locations, solver, threads=problem.threads)
+        return _reset_strays(weighted, fallback, refined)[0]
 
     return solve_reweighted(measured, usual, options.solver.at_scale(measured.graph.num_edges), refine)
 
@@ -522,9 +525,10 @@ def _refine_start(
     as_solved = Start(name=name, locations=locations, refined=None, reset_nodes=np.empty(0, dtype=np.int64))
     if problem.normal_solver is None:
         return as_solved
-    refined = refine_angles(problem.measured, locations, problem.normal_solver, other)
-    refined, nodes = _reset_strays(problem.measured, fallback, refined)
-    if projected_length(problem.measured.graph, refined.locations) <= 0.0:
+    measured, solver = problem.measured, problem.normal_solver
+    refined = refine_angles(measured, locations, solver, other, problem.threads)
+    refined, nodes = _reset_strays(measured, fallback, refined)
+    if projected_length(measured.graph, refined.locations) <= 0.0:
         return as_solved
     return replace(as_solved, refined=refined, reset_nodes=nodes)
 
@@ -589,7 +593,7 @@ def choose_start(
     if len(starts) == 1:
         return by_name["ShapeFit"], f"the starts' lengths differ by {apart:.1%}, so that only one is refined"
     if _is_point(graph, by_name["ShapeFit"].best) and not _is_point(graph, by_name["LUD"].best):
-        return by_name["LUD"], "most cameras of the other start stand in one point"
+        return by_name["LUD"], "most cameras of the other start are in one point"
     difference = costs["LUD"] - costs["ShapeFit"]
     name = "LUD" if difference < -ALIKE * costs["ShapeFit"] else "ShapeFit"  # not as rounding has it
     if apart <= COLLAPSED:

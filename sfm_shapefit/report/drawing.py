@@ -21,6 +21,8 @@ from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.scene.images import Images
 
+MAX_PAIRS = 20_000
+"""Pairs that a page lists and draws; with more it opens slowly."""
 MAX_POINTS = 20_000
 """Points that are drawn; more are thinned evenly."""
 # Distance of a point from the median, in distances within which 90 % of points and cameras lie; points beyond

@@ -1,7 +1,8 @@
 """What the page says first: whether the model is good, what to do next, and the figures that matter."""
 
+import os
 from collections.abc import Iterator, Sequence
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 import numpy as np
 
@@ -17,26 +18,30 @@ _NAMELESS = {"sparse", "dense", "model", "models", "colmap", "text", "triangulat
 
 
 def scene_name(facts: Facts) -> str:
-    """Return the name of the scene: that of the folder which holds the model or database, or of the graph."""
+    """Return the name of the scene: of the folder that holds the model or database, or of the graph."""
     path = facts.inputs.path
     if isinstance(facts, GraphFacts) or path == IN_MEMORY:
         return shorten(PurePath(path).name)
     if isinstance(facts, JoinedFacts):
         return shorten(" + ".join(PurePath(model).name for model in facts.models))
-    parts = PurePath(path).parts
+    parts = Path(os.path.abspath(path)).parts[1:]
     named = [part for part in parts if part.lower() not in _NAMELESS and not part.isdigit()]
     folders = [part for part in named if PurePath(part).suffix.lower() != ".db"]
     return shorten((folders or named or [path])[-1])
 
 
-def banner(drawing: Drawing, facts: Facts) -> dict[str, str]:
-    """Return the verdict in a headline and a sentence, and the next step with its command; see `NextStep`."""
+def banner(drawing: Drawing, facts: Facts, out: str = "OUT", images: str = "IMAGES") -> dict[str, str]:
+    """Return the verdict in a headline and a sentence, and the next step with its command.
+
+    That names `out`, the folder of the model, and `images`, that of the images.
+    """
+    step = facts.next_step.at(out=out, images=images, out_dense=f"{out}_dense")
     return {
         "grade": facts.verdict.grade.value,
         "headline": _headline(drawing, facts),
         "sentence": _sentence(drawing, facts),
-        "next": facts.next_step.text,
-        "command": facts.next_step.command,
+        "next": step.text,
+        "command": step.command,
     }
 
 
@@ -45,6 +50,7 @@ def tiles(drawing: Drawing, facts: Facts) -> list[dict[str, str]]:
     return [
         _placed_tile(drawing),
         *_uncertainty_tile(facts),
+        *_length_tile(facts),
         *_points_tile(drawing, facts),
         _doubtful_tile(drawing, facts),
         *_error_tile(facts),
@@ -124,8 +130,8 @@ def _error_tile(facts: Facts) -> Iterator[dict[str, str]]:
         yield _tile(
             angle if figures.pair_error_px is None else f"{figures.pair_error_px:.2g} px, {angle}",
             "typical error of a pair",
-            "Median angle between what the matches of a pair say and where its cameras stand; in pixels at "
-            "the middle of a picture.",
+            "Median angle between what the matches of a pair that agrees say and where its cameras stand; in "
+            "pixels at the middle of a picture.",
         )
 
 
@@ -136,6 +142,14 @@ def _uncertainty_tile(facts: Facts) -> Iterator[dict[str, str]]:
         label = f"typical uncertainty, {100.0 * share:.2g}% of the scene{scope_of(of)}"
         hint = f"Median standard deviation of a position: {sigma:.2g} {figures.sigma_unit} ({of})."
         yield _tile(f"± {sigma:.2g} units", label, hint)
+
+
+def _length_tile(facts: Facts) -> Iterator[dict[str, str]]:
+    lengths = facts.lengths if isinstance(facts, ModelFacts) else None
+    if lengths is not None and lengths.has_scale:
+        label = f"on a length of {lengths.length:g} {lengths.unit} (95 %)"
+        statement = lengths.statement
+        yield _tile(f"± {lengths.said(lengths.half_width)}", label, f"{statement[0].upper()}{statement[1:]}.")
 
 
 def _doubtful_tile(drawing: Drawing, facts: Facts) -> dict[str, str]:

@@ -16,7 +16,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,11 +37,11 @@ from sfm_shapefit.report.charts import (
     track_length_bars,
     view_graph_matrix,
 )
-from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, input_centers
+from sfm_shapefit.report.drawing import MAX_PAIRS, MAX_POINTS, Drawing, input_centers
 from sfm_shapefit.report.first_screen import banner, scene_name, tiles
+from sfm_shapefit.report.matched import DrawnMatches
 from sfm_shapefit.report.sentences import MAX_TEXT, Hint, first_looks, shorten, summary_sentences
 
-MAX_PAIRS = 20_000  # pairs that the page lists and draws; with more it opens slowly
 _HIGH_TRUST = 0.95  # trust; the chart of trust leaves out cameras above, which need no look
 _NOTED_SHARE = 0.05  # share of points that only two images see; less is not worth a word
 _MAX_HINGES = 20  # hinges named per piece; locate.json has all
@@ -52,28 +52,45 @@ _AXES = "xyz"
 _SCRIPTS = ("core.js", "scene.js", "view.js", "tables.js", "charts.js", "page.js")
 
 
+class Pictures(NamedTuple):
+    """Small pictures of the images."""
+
+    thumbnails: dict[int, str]
+    """Data URLs by row of the cameras, as of `read_thumbnails`."""
+    matches: DrawnMatches | None = None
+    """Matches between them; None where there are none at hand."""
+
+
+class Occasion(NamedTuple):
+    """When and where a page is written."""
+
+    out: str = "OUT"
+    """What the next command calls the folder of the model, as the user typed it."""
+    images: str = "IMAGES"
+    """The same of the images."""
+    day: str = ""
+
+
+UNKNOWN = Occasion()
+"""Where a page is written that nobody keeps."""
+
+
 def write_report(
     drawing: Drawing,
     facts: Facts,
     path: Path,
-    thumbnails: dict[int, str] | None = None,
-    images: Path | str = "",
+    pictures: Pictures | None = None,
+    occasion: Occasion = UNKNOWN,
 ) -> None:
     """Write the report of a result; see `report_html`."""
-    page = report_html(drawing, facts, thumbnails, str(Path(images).absolute()) if thumbnails else "IMAGES")
-    path.write_text(page, encoding="utf-8", newline="\n")
+    path.write_text(report_html(drawing, facts, pictures, occasion), encoding="utf-8", newline="\n")
 
 
 def report_html(
-    drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None = None, images: str = "IMAGES"
+    drawing: Drawing, facts: Facts, pictures: Pictures | None = None, occasion: Occasion = UNKNOWN
 ) -> str:
-    """Return the page.
-
-    Thumbnails are data URLs by row of the cameras, as of `read_thumbnails`; `images` is the folder of the
-    images, for the next command.
-    """
-    data, script = page_data(drawing, facts, thumbnails), _script()
-    data["images"] = images
+    """Return the page, with pictures if there are some."""
+    data, script = page_data(drawing, facts, pictures, occasion), _script()
     values = {
         "title": html.escape(f"{data['title']} \N{EN DASH} sfm_shapefit"),
         "hashes": f"'sha256-{_hash(script)}'",
@@ -85,12 +102,15 @@ def report_html(
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found[1]], _asset("page.html"))
 
 
-def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None = None) -> dict[str, Any]:
+def page_data(
+    drawing: Drawing, facts: Facts, pictures: Pictures | None = None, occasion: Occasion = UNKNOWN
+) -> dict[str, Any]:
     """Return everything that the page shows, as JSON values; cameras and pairs stand worst first."""
     trust = drawing.cameras.trust
-    # Cameras of unknown trust come last; of these, those with a reason come first.
-    has_reason = np.array([bool(reason) for reason in drawing.cameras.reasons], dtype=np.bool_)
-    cameras = np.lexsort((~has_reason, np.nan_to_num(trust), np.isnan(trust)))
+    # Cameras of unknown trust come last; where trust is equal, as it is shown, doubted ones come first.
+    every = zip(drawing.cameras.names, drawing.cameras.reasons, strict=True)
+    is_doubted = np.array([bool(reason) or name in facts.verdict.cameras for name, reason in every], np.bool_)
+    cameras = np.lexsort((~is_doubted, np.round(np.nan_to_num(trust), 2), np.isnan(trust)))
     pairs = drawing.pairs.worst_first()[:MAX_PAIRS]
     reasons: dict[str, int] = {"": 0}
     rank = np.empty(len(cameras), dtype=np.int64)
@@ -100,7 +120,11 @@ def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None 
     return {
         "title": scene_name(facts),
         "subtitle": _subtitle(facts),
-        "banner": {name: shorten(text, 1000) for name, text in banner(drawing, facts).items()},
+        "day": occasion.day,
+        "banner": {
+            name: shorten(text, 1000)
+            for name, text in banner(drawing, facts, occasion.out, occasion.images).items()
+        },
         "tiles": tiles(drawing, facts),
         "summary": summary_sentences(drawing, facts),
         "expertFacts": [shorten(text, 4 * MAX_TEXT) for text in facts.expert_sentences()],
@@ -112,7 +136,8 @@ def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None 
         "axes": drawing.axes.T.ravel().tolist(),
         "middle": display.middle.tolist(),
         "cameras": _cameras(drawing, cameras, display, reasons) | _doubts(drawing, facts, cameras, display),
-        "pictures": None if not thumbnails else [thumbnails.get(k) for k in cameras.tolist()],
+        "pictures": [pictures.thumbnails.get(k) for k in cameras.tolist()] if pictures else None,
+        "matches": _matches(pictures.matches, pairs) if pictures and pictures.matches else None,
         "pairs": _pairs(drawing, pairs, rank, reasons),
         "points": {
             "positions": pack_array(display(drawing.points.xyz), "f4"),
@@ -133,6 +158,7 @@ def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None 
         "lenses": [[shorten(cell) for cell in lens] for lens in drawing.lenses[:_MAX_ROWS]],
         "intrinsics": _cells(facts, "intrinsics", lambda lens: -abs(lens.change)),
         "control": _cells(facts, "control_points", lambda point: -(point.error or 0.0)),
+        "bars": _cells(facts, "scale_bars", lambda bar: -abs(bar.error_sigmas or 0.0)),
         "loops": _cells(facts, "loops", lambda loop: (-loop.num_refused, -loop.num_matches)),
         "pieces": [_piece(k, piece) for k, piece in enumerate(facts.pieces)],
         "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts.timings_s.items()],
@@ -247,6 +273,17 @@ def _pairs(drawing: Drawing, order: IntArray, rank: IntArray, reasons: dict[str,
     } | {name: pack_array(values[order], "f4") for name, values in columns.items()}
 
 
+def _matches(matches: DrawnMatches, listed: IntArray) -> dict[str, Any]:
+    """Return the matches of pairs by their rows on the page, which are those `listed` of the drawing."""
+    row_of = {pair: row for row, pair in enumerate(listed.tolist())}
+    return {
+        "pair": pack_array(np.array([row_of[pair] for pair in matches.pairs.tolist()]), "i4"),
+        "counts": pack_array(matches.counts, "i4"),
+        "drawn": pack_array(matches.drawn, "u1"),
+        "places": pack_array(matches.places, "u2"),
+    }
+
+
 def _encode(texts: Sequence[str], known: dict[str, int]) -> dict[str, str]:
     """Return the numbers of texts, and add those that are new to the known ones."""
     return pack_array(np.array([known.setdefault(text, len(known)) for text in texts], dtype=np.int64), "i4")
@@ -324,7 +361,7 @@ def _notes(drawing: Drawing, residuals_deg: Mapping[str, FloatArray]) -> dict[st
         "matrix": _matrix_note(-(-len(drawing.cameras.names) // MOST_CELLS)),
         "support": _support_note(drawing),
         "convergence": _convergence_note(drawing),
-        "loops": "Pairs far apart in their order are used where the images between say the same.",
+        "loops": "Pairs far apart in their order are used where the images between agree.",
         "control": "The position in the model minus the known one; check points do not set scale and axes.",
         "pieces": "Nothing fixes size and place of one piece against another; they share the cameras named.",
     }

@@ -6,23 +6,25 @@ Sentences are plain text. Names in them come from strangers: whoever shows a sen
 `shorten` keeps a name of any length readable.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.wording import make_printable
-from sfm_shapefit.facts.model import FactsOfModel
+from sfm_shapefit.facts.model import FactsOfModel, ModelFacts
 from sfm_shapefit.facts.placed import Facts
+from sfm_shapefit.judgement.grade import OTHER_PLACE
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.report.drawing import Drawing, PairClass
 
 MAX_TEXT = 160  # characters of a name or sentence that are shown; strangers may write longer ones
+_OF_PAIRS = "of the pairs contradict"  # as a warning says that counts them
 _SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 _FEW_PAIRS = 4  # contradicting pairs; that most are of one camera says nothing where there are fewer
-_HAVE_TABLES = {"intrinsics", "control points", "numbered images"}
+_HAVE_TABLES = {"intrinsics", "control points", "scale bars", "numbered images"}
 _SHOWN = 3  # items of a kind among the first things to look at; the tables have all
 _MOST_WEAK = 6  # weak cameras among these; the table of cameras has all
 
@@ -34,6 +36,8 @@ class Hint:
     text: str
     camera: int | None = None
     pair: int | None = None
+    of_several: bool = False
+    """Whether it is said of several cameras, `camera` being the first."""
 
 
 def shorten(text: str, limit: int = MAX_TEXT) -> str:
@@ -51,6 +55,7 @@ def summary_sentences(drawing: Drawing, facts: Facts) -> list[str]:
     return [
         _pairs(drawing),
         *_certainty(drawing, facts),
+        *_relative_lengths(facts),
         f"Units and axes: {shorten(units or stated, 2 * MAX_TEXT)}.",
         *(
             f"{label[:1].upper()}{label[1:]}: {shorten('; '.join(lines), 4 * MAX_TEXT)}."
@@ -62,34 +67,38 @@ def summary_sentences(drawing: Drawing, facts: Facts) -> list[str]:
 
 def first_looks(drawing: Drawing, facts: Facts) -> list[Hint]:
     """Return what deserves a look, the most telling first; empty if nothing does."""
-    if facts.verdict.grade is Grade.GOOD:  # what is of note there is no task
-        return list(_warnings(drawing, facts, set()))
+    is_told = any(_OF_PAIRS in text for text in facts.warnings)
+    if facts.verdict.grade is Grade.GOOD:  # what is of note there is no task; the banner counts the pairs
+        return [hint for hint in _warnings(drawing, facts, set()) if _OF_PAIRS not in hint.text]
     cameras = [*_left_out(drawing), *_least_trusted(drawing), *_weak(drawing, facts)]
+    warnings = list(_warnings(drawing, facts, {hint.camera for hint in cameras}))
+    told = {hint.camera for hint in [*warnings, *cameras] if not hint.of_several}
     return _one_of_each_camera(
+        drawing,
         [
-            *_warnings(drawing, facts, {hint.camera for hint in cameras}),
+            *warnings,
             *cameras,
-            *_contradictions(
-                drawing, is_told=any("of the pairs contradict" in text for text in facts.warnings)
-            ),
+            *_contradictions(drawing, told, is_told=is_told),
             *_loose(facts),
             *_unchecked(drawing),
-        ]
+        ],
     )
 
 
-def _one_of_each_camera(hints: list[Hint]) -> list[Hint]:
+def _one_of_each_camera(drawing: Drawing, hints: list[Hint]) -> list[Hint]:
     """Return the hints with all that is said of a camera in one, where the first stands."""
     texts: dict[int, list[str]] = {}
     for hint in hints:
-        if hint.camera is not None:
-            texts.setdefault(hint.camera, []).append(hint.text)
+        if hint.camera is not None and not hint.of_several:
+            said = texts.setdefault(hint.camera, [])
+            own = f"{shorten(drawing.cameras.names[hint.camera])}: "
+            said.append(hint.text.removeprefix(own) if said else hint.text)  # the first names it
     found = []
     for hint in hints:
-        if hint.camera is None:
+        if hint.camera is None or hint.of_several:
             found.append(hint)
-        elif said := texts.pop(hint.camera, None):
-            found.append(replace(hint, text="; ".join(said)))
+        elif lines := texts.pop(hint.camera, None):
+            found.append(replace(hint, text="; ".join(lines)))
     return found
 
 
@@ -131,6 +140,13 @@ def _certainty(drawing: Drawing, facts: Facts) -> Iterator[str]:
     yield f"The least certain position is that of {who}: ± {sigma:.2g} units.{shorten(meaning)}"
 
 
+def _relative_lengths(facts: Facts) -> Iterator[str]:
+    """Yield how well lengths are known where nothing known set the scale; else `scene_rows` says it."""
+    lengths = facts.lengths if isinstance(facts, ModelFacts) else None
+    if lengths is not None and not lengths.has_scale:
+        yield f"Relative to the size of the scene, {lengths.relative}."
+
+
 def _warnings(drawing: Drawing, facts: Facts, told: set[int | None]) -> Iterator[Hint]:
     """Yield warnings, but for those of a camera of which something is told anyway.
 
@@ -140,11 +156,12 @@ def _warnings(drawing: Drawing, facts: Facts, told: set[int | None]) -> Iterator
     names = {name: row for row, name in enumerate(drawing.cameras.names) if not name.isdigit()}
     for warning in facts.warnings:
         # The longest name wins, as "11.jpg" is in "111.jpg".
-        named = max((name for name in names if name in warning), key=len, default=None)
-        camera = None if named is None else names[named]
-        if camera is None or camera not in told or warning in evidence:
+        found = [name for name in names if name in warning]
+        rows = [names[one] for one in found if not any(one in name and one != name for name in found)]
+        if not rows or not told.issuperset(rows) or warning in evidence:
             text = shorten(warning, 2 * MAX_TEXT)
-            yield Hint(text=f"{text[:1].upper()}{text[1:]}", camera=camera)
+            text = text if warning.startswith(tuple(found)) else f"{text[:1].upper()}{text[1:]}"
+            yield Hint(text=text, camera=min(rows, default=None), of_several=len(rows) > 1)
 
 
 def _left_out(drawing: Drawing) -> Iterator[Hint]:
@@ -175,18 +192,22 @@ def _weak(drawing: Drawing, facts: Facts) -> Iterator[Hint]:
         if cameras.reasons[k] and cameras.names[k] in facts.verdict.cameras
     ]
     for row in rows[:_MOST_WEAK]:
-        yield Hint(text=f"{shorten(cameras.names[row])}: {shorten(cameras.reasons[row])}", camera=row)
+        clauses = [one for one in cameras.reasons[row].split("; ") if one != OTHER_PLACE]  # which is told
+        if clauses:
+            yield Hint(text=f"{shorten(cameras.names[row])}: {shorten('; '.join(clauses))}", camera=row)
     if len(rows) > _MOST_WEAK:
         yield Hint(text=f"{len(rows) - _MOST_WEAK:,} more are weak; the table of cameras says why")
 
 
-def _contradictions(drawing: Drawing, *, is_told: bool) -> Iterator[Hint]:
-    """Yield the contradicting pairs with most matches: repeated structure, or wrong rotations.
+def _contradictions(drawing: Drawing, told: Collection[int | None], *, is_told: bool) -> Iterator[Hint]:
+    """Yield the contradicting pairs with most matches, but for those of cameras of which something is told.
 
-    How many there are comes first, if that `is_told` by no warning.
+    They are repeated structure, or wrong rotations. How many there are comes first, if that `is_told` by no
+    warning.
     """
     pairs = drawing.pairs
-    against = np.flatnonzero(pairs.classes == PairClass.CONTRADICTS)
+    of_others = ~np.isin(pairs.cameras, [row for row in told if row is not None]).any(axis=1)
+    against = np.flatnonzero((pairs.classes == PairClass.CONTRADICTS) & of_others)
     if len(against) and not is_told:
         yield _set_aside(drawing, against)
     order = np.lexsort((-pairs.residuals_deg[against], -pairs.support[against]))

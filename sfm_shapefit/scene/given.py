@@ -1,7 +1,7 @@
 """What a user knows of the images beside the matches: positions, control points, gravity; types only."""
 
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 
@@ -62,14 +62,11 @@ _THIN = 1e-3  # width over length of control points; thinner ones say nothing of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ControlPoints:
-    """Points of known position, and where images show them."""
+class Marks:
+    """Points, and where images show them."""
 
     names: tuple[str, ...]
-    positions: FloatArray
-    """(k, 3) in axes and units of their own."""
-    is_check: BoolArray
-    """(k,) points that only check the model."""
+    """(k,)"""
     points: IntArray
     """(m,) the point of each mark, ascending."""
     images: IntArray
@@ -78,10 +75,8 @@ class ControlPoints:
     """(m, 2)"""
     statement: str
     """Where they come from, and what their axes are."""
-    datum: EarthDatum | None = None
-    """Where their origin is on Earth, if that is known."""
 
-    def of(self, images: IntArray) -> "ControlPoints":
+    def of(self, images: IntArray) -> Self:
         """Return them with the marks in some images (n,), ascending, numbered by their place among these."""
         inside = np.isin(self.images, images)
         return replace(
@@ -94,6 +89,18 @@ class ControlPoints:
     def seen_twice(self) -> BoolArray:
         """Return which points have marks in two images, (k,)."""
         return np.bincount(self.points, minlength=len(self.names)) > 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlPoints(Marks):
+    """Points of known position."""
+
+    positions: FloatArray
+    """(k, 3) in axes and units of their own."""
+    is_check: BoolArray
+    """(k,) points that only check the model."""
+    datum: EarthDatum | None = None
+    """Where their origin is on Earth, if that is known."""
 
     def why_too_few(self) -> str:
         """Return why the points cannot set scale and axes, a clause; empty if they can."""
@@ -111,8 +118,34 @@ def why_too_few(positions: FloatArray, what: str) -> str:
     return ""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScaleBars(Marks):
+    """Known distances between points: those 2 b and 2 b + 1 are the ends of bar b."""
+
+    bars: tuple[str, ...]
+    """(b,) names."""
+    lengths: FloatArray
+    """(b,) in the output's units."""
+    sigmas: FloatArray
+    """(b,) their standard deviations."""
+    is_check: BoolArray
+    """(b,) bars that only check the model."""
+    places: tuple[str, ...]
+    """(b,) file and line of each, to begin a sentence with."""
+
+    @property
+    def ends(self) -> IntArray:
+        """The two points of each bar, (b, 2)."""
+        return np.arange(2 * len(self.bars)).reshape(-1, 2)
+
+    @property
+    def are_seen(self) -> BoolArray:
+        """Bars with a mark, (b,)."""
+        return np.bincount(self.points // 2, minlength=len(self.bars)) > 0
+
+
 class MarkedViews(NamedTuple):
-    """How placed images see the marks of control points, each through a camera of its own."""
+    """How placed images see marks, each through a camera of its own."""
 
     rotations: FloatArray
     """(r, 3, 3) cam_from_world: of the image, or turned to the mark where that is not before the image."""
@@ -121,7 +154,7 @@ class MarkedViews(NamedTuple):
     focal_lengths_px: FloatArray
     """(r,)"""
     rows: IntArray
-    """(r,) the marks in placed images, by their place in `ControlPoints`, ascending."""
+    """(r,) the marks in placed images, by their place in `Marks`, ascending."""
     images: IntArray
     """(r,) image of each mark."""
     on_plane: FloatArray
@@ -162,7 +195,13 @@ class Known:
 
     priors: PositionPriors | None = None
     control: ControlPoints | None = None
+    bars: ScaleBars | None = None
     gravity: Gravity | None = None
+
+    @property
+    def sets_scale(self) -> bool:
+        """Whether points or bars that images show are to set the scale."""
+        return self.control is not None or (self.bars is not None and not self.bars.is_check.all())
 
     def of(self, images: IntArray) -> "Known":
         """Return what is told of some images (n,), ascending, numbered by their place among these."""

@@ -21,13 +21,12 @@ from sfm_shapefit.base.arrays import (
     BoolArray,
     FloatArray,
     IntArray,
-    Lists,
     UInt32Array,
     hand_back_memory,
-    rows_of_parts,
 )
 from sfm_shapefit.base.executors import Advance, made_ahead, nobody
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 
@@ -57,31 +56,29 @@ class RayMatches(Lists):
 
     def rays_of(self, chosen: IntArray) -> "RayMatches":
         """Return the rays of some of the pairs, in that order."""
-        offsets, rows = rows_of_parts(self.offsets, chosen)
         pairs, pixel_angles = self.pairs[chosen], self.pixel_angles[chosen]
-        return replace(self._taken(offsets, rows), pairs=pairs, pixel_angles=pixel_angles)
+        return replace(self._taken(self.rows_of(chosen)), pairs=pairs, pixel_angles=pixel_angles)
 
     def thinned(self, most: int) -> "RayMatches":
         """Return the pairs with at most so many matches each, taken evenly."""
         counts = self.lengths()
         taken = np.minimum(counts, most)
-        offsets = np.append(0, np.cumsum(taken))
-        position = np.arange(offsets[-1]) - np.repeat(offsets[:-1], taken)
-        steps = position * np.repeat(counts, taken) // np.repeat(taken, taken)
-        return self._taken(offsets, np.repeat(self.offsets[:-1], taken) + steps)
+        places = RowLists(offsets_of(taken), np.zeros(0, dtype=np.int64))
+        steps = places.ranks() * places.spread(counts) // places.spread(taken)
+        return self._taken(replace(places, rows=places.spread(self.offsets[:-1]) + steps))
 
-    def _taken(self, offsets: IntArray, rows: IntArray) -> "RayMatches":
+    def _taken(self, kept: RowLists) -> "RayMatches":
         return RayMatches(
             pairs=self.pairs,
-            offsets=offsets,
-            rays_i=self.rays_i[rows],
-            rays_j=self.rays_j[rows],
+            offsets=kept.offsets,
+            rays_i=self.rays_i[kept.rows],
+            rays_j=self.rays_j[kept.rows],
             pixel_angles=self.pixel_angles,
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class KeypointMatches:
+class KeypointMatches(Lists):
     """The matches of k image pairs, M in all, one pair after the other, as keypoints; no rays."""
 
     pairs: IntArray
@@ -200,8 +197,8 @@ class MatchPart(Protocol):
     def num_pairs(self) -> int:
         """Number of pairs."""
 
-    def open(self) -> AbstractContextManager["View"]:
-        """Open the file again, for a view of the same images and these pairs, which are read once."""
+    def open(self, images: Images) -> AbstractContextManager["View"]:
+        """Open the file again, for a view of the same images and of these pairs, which are read once."""
 
 
 class View:
@@ -312,7 +309,7 @@ class View:
 
     def parts(self, max_matches: int) -> Sequence[MatchPart]:
         """Return all pairs, in their order, in parts of about equally many matches; see `Matches.parts`."""
-        totals = np.append(0, np.cumsum(self._counts))
+        totals = offsets_of(self._counts)
         count = max(-(-int(totals[-1]) // max(max_matches, 1)), 1)
         bounds = np.unique(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
         bounds[-1] = len(totals) - 1
@@ -330,7 +327,7 @@ class View:
     def _batches(self, chosen: IntArray, min_matches: int) -> Iterator[MatchBatch]:
         for found in self._links(chosen, min_matches):
             self._keep_rays(np.unique(found.pairs))
-            rows = np.repeat(self._begins[found.pairs], np.diff(found.offsets), axis=0) + found.keypoints
+            rows = found.spread(self._begins[found.pairs]) + found.keypoints
             yield MatchBatch(
                 pairs=found.pairs,
                 offsets=found.offsets,
@@ -353,7 +350,7 @@ class View:
         counts, keypoints = self.matches.read(self.rows[chosen], keep=self.reading.keeps)
         if not all_see:
             has_ray = np.ones(len(keypoints), dtype=np.bool_)
-            ends = itertools.pairwise(np.append(0, np.cumsum(counts)).tolist())
+            ends = itertools.pairwise(offsets_of(counts).tolist())
             for images, (first, last) in zip(pairs.tolist(), ends, strict=True):
                 for side, image in enumerate(images):
                     blind = self._blind_of(image)
@@ -366,7 +363,7 @@ class View:
             keypoints = keypoints[np.repeat(kept, counts)]
         return KeypointMatches(
             pairs=pairs[kept],
-            offsets=np.append(0, np.cumsum(counts[kept])),
+            offsets=offsets_of(counts[kept]),
             keypoints=keypoints.astype(np.int64),
         )
 

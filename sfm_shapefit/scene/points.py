@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, Lists
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import Similarity
+from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
 from sfm_shapefit.scene.matches import KeypointMatches
 
 
@@ -40,8 +41,7 @@ class Points(Lists):
 
     def rows_of_images(self, num_images: int) -> list[IntArray]:
         """Return the observations of each image, ascending."""
-        order = np.argsort(self.images, kind="stable")
-        return np.split(order, np.searchsorted(self.images[order], np.arange(1, num_images)))
+        return list(RowLists.by_label(self.images, num_images))
 
     def paired(self, chosen: BoolArray) -> BoolArray:
         """Return which observations (o,) are chosen with another one of their point."""
@@ -53,7 +53,7 @@ class Points(Lists):
         kept = lengths > 0
         return Points(
             xyz=self.xyz[kept],
-            offsets=np.append(0, np.cumsum(lengths[kept])),
+            offsets=offsets_of(lengths[kept]),
             images=self.images[chosen],
             keypoints=self.keypoints[chosen],
             ids=self.ids[kept],
@@ -71,12 +71,12 @@ class Points(Lists):
             links: matches of all pairs of images.
             least: observations of a point that a keypoint is to match.
         """
-        begins = np.append(0, np.cumsum(num_keypoints))
+        begins = offsets_of(num_keypoints)
         point_of = np.full(begins[-1], -1)
         point_of[begins[self.images] + self.keypoints] = self.points_seen()
         observations = [np.zeros((0, 3), dtype=np.int64)]
         for batch in links:
-            ends = np.repeat(batch.pairs, np.diff(batch.offsets), axis=0)
+            ends = batch.spread(batch.pairs)
             for end in (0, 1):
                 points = point_of[begins[ends[:, 1 - end]] + batch.keypoints[:, 1 - end]]
                 rows = np.flatnonzero(others[ends[:, end]] & (points >= 0))
@@ -94,7 +94,7 @@ class Points(Lists):
         order = np.argsort(points, kind="stable")
         return replace(
             self,
-            offsets=np.append(0, np.cumsum(np.bincount(points, minlength=self.num_points))),
+            offsets=offsets_of(np.bincount(points, minlength=self.num_points)),
             images=np.append(self.images, new[:, 1])[order],
             keypoints=np.append(self.keypoints, new[:, 2])[order],
         )
@@ -105,7 +105,7 @@ class Points(Lists):
 
     def _count(self, chosen: BoolArray) -> IntArray:
         """Return how many observations of each point are chosen, (x,)."""
-        return np.diff(np.append(0, np.cumsum(chosen))[self.offsets])
+        return np.diff(offsets_of(chosen)[self.offsets])
 
 
 def number_points(parts: Sequence[Points]) -> Points:
@@ -119,7 +119,7 @@ def concatenate_points(parts: Sequence[Points]) -> Points:
     lengths = np.concatenate([np.zeros(0, dtype=np.int64), *(part.lengths() for part in parts)])
     return Points(
         xyz=np.concatenate([np.zeros((0, 3)), *(part.xyz for part in parts)]),
-        offsets=np.append(0, np.cumsum(lengths)),
+        offsets=offsets_of(lengths),
         images=np.concatenate([np.zeros(0, dtype=np.int64), *(part.images for part in parts)]),
         keypoints=np.concatenate([np.zeros(0, dtype=np.int64), *(part.keypoints for part in parts)]),
         ids=np.concatenate([np.zeros(0, dtype=np.int64), *(part.ids for part in parts)]),

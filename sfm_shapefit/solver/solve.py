@@ -20,7 +20,7 @@ from sfm_shapefit.laplacian.factor import FactorPlan, analyze
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton.dense import solve_newton_dense
-from sfm_shapefit.solver.newton.sparse import solve_newton_reduced, solve_newton_sparse
+from sfm_shapefit.solver.newton.sparse import allocate_newton, solve_newton_reduced, solve_newton_sparse
 from sfm_shapefit.solver.program import normalize_locations, objective, scale_functional
 from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.solver_options import (
@@ -200,7 +200,8 @@ def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     if flops() < np.inf:
         predicted = f"{flops() / 1e9:.2g} Gflop for a sparse factor"
     if asked or flops() <= _LARGEST_NEWTON_FLOPS:
-        return Choice("newton", solve_newton_sparse, "asked for" if asked else predicted)
+        newton = partial(_solve_sparse, resources.threads)
+        return Choice("newton", newton, "asked for" if asked else predicted)
     return Choice("admm", partial(_split, resources, predict()), f"{predicted}: splitting is faster")
 
 
@@ -226,6 +227,12 @@ def _choose_over_groups(graph: ViewGraph, groups: RigidGroups, options: SolverOp
         return solve_newton_reduced(graph, reduction, tol, limit, watch)
 
     return Choice("newton", newton, reason)
+
+
+def _solve_sparse(
+    threads: int, graph: ViewGraph, tol: float, limit: int, watch: OnIteration | None
+) -> tuple[FloatArray, FloatArray, int]:
+    return solve_newton_sparse(graph, tol, limit, watch, factor=allocate_newton(graph, threads=threads))
 
 
 def _split(

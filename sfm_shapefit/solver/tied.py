@@ -18,6 +18,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.reduction import Reduction
@@ -75,9 +76,7 @@ def general_positions(groups: RigidGroups) -> FloatArray:
 
 
 def _components(ends: IntArray, count: int) -> list[IntArray]:
-    labels = connected_components(count, ends)
-    order = np.argsort(labels, kind="stable")
-    return np.split(order.astype(np.int64), np.cumsum(np.bincount(labels))[:-1])
+    return list(RowLists.by_label(connected_components(count, ends)))
 
 
 def _null_motions(edges: IntArray, groups: RigidGroups, locations: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, sum_by
 from sfm_shapefit.base.forests import connected_components
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.quiet import quiet_log
@@ -114,8 +115,7 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     surface = [surface_points(scene, k, xy) for k, xy in enumerate(keypoints)]
     is_right = np.zeros(len(joined.keypoints), dtype=np.bool_)
     wrong = np.zeros(len(joined.pairs), dtype=np.bool_)
-    for e, (i, j) in enumerate(joined.pairs.tolist()):
-        rows = slice(joined.offsets[e], joined.offsets[e + 1])
+    for e, ((i, j), rows) in enumerate(zip(joined.pairs.tolist(), joined.slices(), strict=True)):
         a, b = joined.keypoints[rows].T
         errors = np.maximum(
             _transfer_error_px(scene, j, surface[i][a], keypoints[j][b]),
@@ -194,9 +194,9 @@ def _parts(scene: RenderedScene, judged: JudgedMatches | None) -> ModelParts:
 def _true_points(judged: JudgedMatches) -> Points:
     """Return the points along right matches, each at the mean of the surface points under its keypoints."""
     counts = [len(xy) for xy in judged.keypoints]
-    first, image = np.cumsum([0, *counts]), np.repeat(np.arange(len(counts)), counts)
-    pair = np.repeat(np.arange(len(judged.matches.pairs)), np.diff(judged.matches.offsets))
-    nodes = (judged.matches.keypoints + first[judged.matches.pairs[pair]])[judged.is_right]
+    first, image = offsets_of(counts), np.repeat(np.arange(len(counts)), counts)
+    firsts = judged.matches.spread(first[judged.matches.pairs])
+    nodes = (judged.matches.keypoints + firsts)[judged.is_right]
     label = connected_components(int(first[-1]), nodes)
     rows = np.unique(label * len(counts) + image, return_index=True)[1]  # the first in each image
     rows = rows[np.bincount(label[rows])[label[rows]] >= 2]
@@ -204,7 +204,7 @@ def _true_points(judged: JudgedMatches) -> Points:
     surface = np.concatenate(judged.surface)[rows]
     return Points(
         xyz=sum_by(place, surface, len(known)) / lengths[:, None],
-        offsets=np.append(0, np.cumsum(lengths)),
+        offsets=offsets_of(lengths),
         images=image[rows],
         keypoints=rows - first[image[rows]],
         ids=np.arange(1, len(known) + 1),

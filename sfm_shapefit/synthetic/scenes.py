@@ -24,6 +24,7 @@ from scipy.sparse import coo_array, csr_array
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.synthetic.layouts import (
     FARTHEST_M,
     ByteArray,
@@ -132,7 +133,7 @@ def build_scene(
         keypoints=tuple(keypoints),
         keypoint_points=tuple(keypoint_points),
         pairs=pairs,
-        match_offsets=np.cumsum([0] + [len(rows) for rows in lists], dtype=np.int64),
+        match_offsets=offsets_of([len(rows) for rows in lists]),
         matches=np.concatenate([rows for rows, _ in scrambled]),
         match_is_wrong=np.concatenate([wrong for _, wrong in scrambled]),
         pair_is_corrupted=np.isin(np.arange(len(pairs)), list(false_lists)),

@@ -19,6 +19,7 @@ import pycolmap
 
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.synthetic import models
@@ -68,7 +69,7 @@ def _points(scene: Scene) -> Points:
     shown = np.flatnonzero(length >= 2)
     return Points(
         xyz=scene.points[shown],
-        offsets=np.append(0, np.cumsum(length[shown])),
+        offsets=offsets_of(length[shown]),
         images=image[visible],
         keypoints=keypoint[visible],
         ids=shown + 1,

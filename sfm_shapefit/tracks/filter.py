@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import batch_ranges
 from sfm_shapefit.scene.points import Points
@@ -68,7 +69,7 @@ def _are_wide(points: Points, centers: FloatArray, least_deg: float) -> BoolArra
         for first in range(int(lengths.max(initial=1)) - 1):
             left = np.flatnonzero(~wide[begin:end] & (lengths > first + 1))  # a few, after the first round
             own, counts = offsets[left] - offsets[0] + first, lengths[left] - first - 1
-            others = np.repeat(own + 1 - np.append(0, np.cumsum(counts))[:-1], counts)
+            others = np.repeat(own + 1 - offsets_of(counts)[:-1], counts)
             ahead = rays[others + np.arange(len(others))]
             cosines = np.abs(np.einsum("pa,pa->p", np.repeat(rays[own], counts, axis=0), ahead))
             wide[begin + np.repeat(left, counts)[cosines <= cosine]] = True

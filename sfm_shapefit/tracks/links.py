@@ -1,15 +1,16 @@
 """Tracks: which keypoints of which cameras are taken for the same point, before any point is known."""
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, Lists, rows_of_parts
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
 from sfm_shapefit.tracks.joining import number_trees, sampson_px, write_ray
 
 # Between two slices Python can be interrupted: about 200 ms. For each all keypoints are counted.
@@ -28,26 +29,6 @@ class CameraPoses:
     """(c,)"""
     images: IntArray
     """(c,) the image of each; views of one image follow one another."""
-
-
-class JoinedRows(NamedTuple):
-    """Tracks by the rows of their keypoints: track t has rows[offsets[t]:offsets[t + 1]]."""
-
-    offsets: IntArray
-    """(t + 1,)"""
-    rows: IntArray
-    """(m,) rows of other arrays."""
-
-    def subset(self, chosen: IntArray) -> "JoinedRows":
-        """Return the given tracks, in that order."""
-        offsets, rows = rows_of_parts(self.offsets, chosen)
-        return JoinedRows(offsets, self.rows[rows])
-
-    def of_points(self, points_seen: IntArray) -> "JoinedRows":
-        """Return the tracks of points, one each: what rows (m,) see, -1 for those to be left out."""
-        order = np.argsort(points_seen, kind="stable")[np.sum(points_seen < 0) :]
-        offsets = np.append(0, np.cumsum(np.bincount(points_seen[order]))).astype(np.int64)
-        return JoinedRows(offsets, self.rows[order])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,17 +57,16 @@ class ObservedTracks(Lists):
 
     def subset(self, chosen: IntArray) -> "ObservedTracks":
         """Return the given tracks, in that order."""
-        every = JoinedRows(self.offsets, np.arange(len(self.cameras)))
-        return self._of_rows(every.subset(chosen), self.ids[chosen])
+        return self._of_rows(self.rows_of(chosen), self.ids[chosen])
 
     def of_points(self, points_seen: IntArray) -> "ObservedTracks":
         """Return the tracks of points, one each: what observations (m,) see, -1 for those to be left out."""
         if np.array_equal(points_seen, self.list_of_rows()):
             return replace(self, ids=np.arange(self.num_tracks))  # as of matches, and large
-        joined = JoinedRows(self.offsets, np.arange(len(self.cameras))).of_points(points_seen)
+        joined = RowLists.by_label(points_seen)
         return self._of_rows(joined, np.arange(len(joined.offsets) - 1))
 
-    def _of_rows(self, joined: JoinedRows, ids: IntArray) -> "ObservedTracks":
+    def _of_rows(self, joined: RowLists, ids: IntArray) -> "ObservedTracks":
         rows = joined.rows
         return replace(
             self,
@@ -136,7 +116,7 @@ class MatchedKeypoints:
             matches=row_of[self.matches[chosen[self.matches].all(axis=1)]],
         )
 
-    def join(self, poses: CameraPoses, limit_px: float, threads: int = 1) -> JoinedRows:
+    def join(self, poses: CameraPoses, limit_px: float, threads: int = 1) -> RowLists:
         """Return the connected components under the matches that agree with the poses.
 
         A wrong match would join two tracks; nearly all wrong ones miss their epipolar line.
@@ -155,9 +135,9 @@ class MatchedKeypoints:
         rows, lengths = np.argsort(track, kind="stable"), np.bincount(track)
         del track
         rows, lengths = rows[np.repeat(lengths > 1, lengths)], lengths[lengths > 1]
-        return JoinedRows(np.append(0, np.cumsum(lengths)), rows)
+        return RowLists(offsets_of(lengths), rows)
 
-    def observed(self, joined: JoinedRows) -> ObservedTracks:
+    def observed(self, joined: RowLists) -> ObservedTracks:
         """Return tracks that are known by their rows."""
         rows = joined.rows
         return ObservedTracks(

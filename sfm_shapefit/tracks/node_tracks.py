@@ -23,9 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, Lists, rows_of_parts
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.forests import merge_sets, root_of
 from sfm_shapefit.base.jit import kernel, mix_bits
+from sfm_shapefit.base.lists import Lists, offsets_of
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
@@ -61,8 +62,8 @@ class Tracks(Lists):
 
     def subset(self, chosen: IntArray) -> "Tracks":
         """Return the given tracks, in that order."""
-        offsets, rows = rows_of_parts(self.offsets, chosen)
-        return Tracks(offsets=offsets, cameras=self.cameras[rows], rays=self.rays[rows])
+        own = self.rows_of(chosen)
+        return Tracks(offsets=own.offsets, cameras=self.cameras[own.rows], rays=self.rays[own.rows])
 
 
 class TrackJoiner:
@@ -87,7 +88,7 @@ class TrackJoiner:
             max_matches: whose keypoints are held in memory; of more, a share of the keypoints is drawn.
         """
         self._threshold_px, self._share = threshold_px, min(1.0, max_matches / max(num_matches, 1))
-        self._begins = np.append(0, np.cumsum(num_keypoints))
+        self._begins = offsets_of(num_keypoints)
         self._places = np.full(int(self._begins[-1]), -1, dtype=np.int32)
         self._parents, self._rays, self._count = np.empty(0, dtype=np.int64), [np.zeros((0, 3))], 0
         # By observation: number and exclusive or of its neighbors in the forest; that of its random numbers.
@@ -96,9 +97,9 @@ class TrackJoiner:
     def add(self, batch: MatchBatch, directions: PairDirections) -> None:
         """Join the matches that agree with the directions of their pairs, which are those of the batch."""
         row = np.where(is_usable(directions.status), np.arange(len(batch.pairs)), -1)
-        counts = np.diff(batch.offsets)
+        counts = batch.lengths()
         drawn = _draw_matches(batch, counts, self._share)
-        keypoints = np.repeat(self._begins[batch.pairs], counts, axis=0) + batch.keypoints
+        keypoints = batch.spread(self._begins[batch.pairs]) + batch.keypoints
         new_rays = np.empty((min(2 * len(keypoints), len(self._places) - self._count), 3))
         largest = self._count + len(new_rays)
         if largest > len(self._parents):
@@ -216,7 +217,7 @@ def _collect(places: Int32Array, begins: IntArray, parents: IntArray, rays: Floa
     good = ~repeated & (lengths >= _MIN_VIEWS)
     kept = good[track]
     return Tracks(
-        offsets=np.append(0, np.cumsum(lengths[good])).astype(np.int64),
+        offsets=offsets_of(lengths[good]),
         cameras=camera[kept].astype(np.int64),
         rays=rays[seen[kept]],
     )
@@ -238,7 +239,7 @@ def covering_set(tracks: Tracks, num_cameras: int, per_camera: int | None = None
 
 def _worth(tracks: Tracks) -> FloatArray:
     """Return how much a track says: the root of its length times the widest angle of its rays, limited."""
-    first = tracks.rays[np.repeat(tracks.offsets[:-1], tracks.lengths())]
+    first = tracks.spread(tracks.rays[tracks.offsets[:-1]])
     apart = np.linalg.norm(tracks.rays - first, axis=1)
     widest = np.maximum.reduceat(apart, tracks.offsets[:-1])
     return np.asarray(np.sqrt(tracks.lengths()) * np.minimum(widest, _WIDEST_RAD))

@@ -15,7 +15,7 @@ for the middle point.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -25,12 +25,14 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.lists import RowLists, offsets_of
 from sfm_shapefit.tracks.joining import write_ray
-from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTracks
 
 # Observations between which Python can be interrupted: about 0.1 s.
 _SLICE = 100_000
 _SLICES_A_THREAD = 4  # slices of tracks at least; with one, long tracks would hold up the others
+_JOINED_AT_ONCE = 2_000_000  # observations whose pixels are put together; they take 100 MB
 _PAIRS = 15  # pairs of observations that are tried for each point; all of six observations
 _STEPS = 5  # Gauss-Newton steps for a point; they begin within the limit of its observations
 _STILL = 1e-9  # length of a step over the distance of the point; the steps end with a shorter one
@@ -91,7 +93,7 @@ def triangulate_tracks(
     """
     lengths = tracks.lengths()
     seen = np.full(len(tracks.cameras), -1)
-    room = np.append(0, np.cumsum(lengths // max(limits.min_length, 2)))  # for the points of each track
+    room = offsets_of(lengths // max(limits.min_length, 2))  # for the points of each track
     points = np.empty((int(room[-1]), 3))
     track_of = np.empty(len(points), dtype=np.int64)
     figures = np.array(
@@ -149,7 +151,7 @@ def triangulate_matches(
     """
     place = poses, limits, threads
     joined = matched.join(poses, limits.max_error_px, threads)
-    is_chain = np.diff(joined.offsets) > _CHAIN * _count_images(joined, poses.images[matched.cameras])
+    is_chain = joined.lengths() > _CHAIN * _count_images(joined, poses.images[matched.cameras])
     is_left: BoolArray = np.zeros(len(matched.cameras), dtype=np.bool_)
     is_left[joined.subset(np.flatnonzero(is_chain)).rows] = True
     parts = [_triangulate_joined(matched, joined.subset(np.flatnonzero(~is_chain)), *place)]
@@ -157,20 +159,18 @@ def triangulate_matches(
     for limit_px in joining_limits_px(threshold_px, limits.max_error_px) if is_chain.any() else ():
         left, rows = left.among(is_left), rows[is_left]
         points, seen = _triangulate_joined(left, left.join(poses, limit_px, threads), *place)
-        parts.append((points, JoinedRows(seen.offsets, rows[seen.rows])))
+        parts.append((points, RowLists(seen.offsets, rows[seen.rows])))
         is_left = np.ones(len(rows), dtype=np.bool_)
         is_left[seen.rows] = False
-    lengths = np.concatenate([np.diff(seen.offsets) for _, seen in parts])
-    tracks = JoinedRows(np.append(0, np.cumsum(lengths)), np.concatenate([seen.rows for _, seen in parts]))
-    every = np.arange(len(lengths))
+    tracks = _concatenate([seen for _, seen in parts])
     return matched.observed(tracks), TriangulatedPoints(
         points=np.concatenate([points for points, _ in parts]),
-        tracks=every,
-        points_seen=np.repeat(every, lengths),
+        tracks=np.arange(len(tracks.offsets) - 1),
+        points_seen=tracks.list_of_rows(),
     )
 
 
-def _count_images(joined: JoinedRows, images: IntArray) -> IntArray:
+def _count_images(joined: RowLists, images: IntArray) -> IntArray:
     """Return how many images the keypoints of each track are of, whose own images (K,) ascend."""
     own, is_new = images[joined.rows], np.ones(len(joined.rows), dtype=np.int64)
     is_new[1:] = own[1:] != own[:-1]
@@ -179,11 +179,24 @@ def _count_images(joined: JoinedRows, images: IntArray) -> IntArray:
 
 
 def _triangulate_joined(
-    matched: MatchedKeypoints, joined: JoinedRows, poses: CameraPoses, limits: PointLimits, threads: int
-) -> tuple[FloatArray, JoinedRows]:
+    matched: MatchedKeypoints, joined: RowLists, poses: CameraPoses, limits: PointLimits, threads: int
+) -> tuple[FloatArray, RowLists]:
     """Return the points (k, 3) of joined keypoints, and the rows that see each."""
-    found = triangulate_tracks(matched.observed(joined), poses, limits, threads)
-    return found.points, joined.of_points(found.points_seen)
+    number, total = -(-len(joined.rows) // _JOINED_AT_ONCE) or 1, len(joined.rows)
+    cuts = np.searchsorted(joined.offsets, np.arange(1, number) * total // number).tolist()
+    points, seen = list[FloatArray](), list[RowLists]()
+    for tracks in pairwise([0, *cuts, len(joined.offsets) - 1]):
+        own = joined.subset(np.arange(*tracks))
+        found = triangulate_tracks(matched.observed(own), poses, limits, threads)
+        points.append(found.points)
+        seen.append(own.of(RowLists.by_label(found.points_seen, len(found.points))))
+    return np.concatenate(points), _concatenate(seen)
+
+
+def _concatenate(parts: Sequence[RowLists]) -> RowLists:
+    """Return the lists of all parts."""
+    lengths = np.concatenate([part.lengths() for part in parts])
+    return RowLists(offsets_of(lengths), np.concatenate([part.rows for part in parts]))
 
 
 @inner_kernel

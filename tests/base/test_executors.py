@@ -5,17 +5,22 @@ from threading import Event, get_ident
 
 import pytest
 
-from sfm_shapefit.base.executors import WorkerError, answers, in_ranges, in_threads, made_ahead
+from sfm_shapefit.base.executors import Crew, in_ranges, in_threads, made_ahead
 
 
 def square(number):
     return number * number
 
 
-@pytest.mark.parametrize("workers", [1, 3])
-def test_answers_come_with_their_tasks_in_order(workers):
-    with ThreadPoolExecutor(workers) as pool:
-        assert list(answers(pool, square, range(100))) == [(k, k * k) for k in range(100)]
+class Pool(ThreadPoolExecutor):
+    """Threads in place of a cluster; arguments are no futures."""
+
+
+@pytest.mark.parametrize("workers", [0, 1, 3])
+def test_answers_come_in_order_whoever_works(workers):
+    with Pool(max(workers, 1)) as pool:
+        crew = Crew(1, pool if workers else None)
+        assert list(crew.stream(square, range(100))) == [k * k for k in range(100)]
 
 
 @pytest.mark.parametrize("threads", [0, 1, 3])
@@ -58,9 +63,9 @@ def test_one_item_is_made_while_another_is_used(threads):
 
 def test_tasks_are_made_only_a_few_ahead_of_the_answers():
     made = []
-    with ThreadPoolExecutor(2) as pool:
-        for task, _ in answers(pool, square, (made.append(k) or k for k in range(100))):
-            assert len(made) <= task + 32
+    with Pool(2) as pool:
+        for square_of in Crew(1, pool).stream(square, (made.append(k) or k for k in range(100))):
+            assert len(made) <= square_of**0.5 + 32
     assert made == list(range(100))
 
 
@@ -72,22 +77,11 @@ def test_what_is_not_asked_for_any_more_is_cancelled():
         go_on.wait(10.0)
         return task
 
-    with ThreadPoolExecutor(1) as pool:
-        found = answers(pool, wait, range(20))
+    with Pool(1) as pool:
+        found = Crew(1, pool).stream(wait, range(20))
         go_on.set()
-        assert next(found) == (0, 0)
+        assert next(found) == 0
         go_on.clear()
         found.close()
         go_on.set()
     assert len(begun) < 20
-
-
-def test_a_worker_that_fails_is_reported_in_one_sentence():
-    def fail(_task):
-        raise MemoryError("no room\nand more")
-
-    with (
-        ThreadPoolExecutor(1) as pool,
-        pytest.raises(WorkerError, match=r"a worker failed \(no room\); check"),
-    ):
-        list(answers(pool, fail, [1]))

@@ -599,14 +599,8 @@ def test_map_takes_a_folder_by_its_database_and_refuses_one_without(tmp_path):
 
 def test_what_is_not_installed_has_an_exit_code_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    said = run_refused("locate", RING_MODEL, tmp_path / "out", "--executor", "dask", "-q", code=5)
-    assert "the executor dask needs dask.distributed: pip install" in said
-
-
-@pytest.mark.parametrize("name", ["threads", "dask:", "serial:1", "processes:2"])
-def test_an_executor_that_does_not_exist_is_refused_as_a_value(name, tmp_path):
-    said = run("locate", RING_MODEL, tmp_path / "out", "--executor", name, code=2).output
-    assert "serial, processes, dask, dask:ADDRESS" in said
+    said = run_refused("locate", RING_MODEL, tmp_path / "out", "--scheduler", "a:1", "-q", code=5)
+    assert "--scheduler needs dask.distributed: pip install" in said
 
 
 def test_a_word_that_a_flag_does_not_take_is_refused_without_words_of_a_library(tmp_path):

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
-from sfm_shapefit.judgement.wrong_lenses import question_lenses, wrong_lenses
+from sfm_shapefit.judgement.wrong_lenses import ContradictedLens, question_lenses, wrong_lenses
 from sfm_shapefit.scene.images import Frames, Images, Sensors
-from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE, Lens, Origin
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
 from tests.adjustment.made import look_at
@@ -205,3 +205,21 @@ def test_neither_threads_nor_which_others_are_asked_change_a_bit():
         assert getattr(once, name).tobytes() == getattr(twice, name).tobytes()
         assert getattr(alone, name)[asked].tobytes() == getattr(once, name)[asked].tobytes()
     assert alone.num_observations[~asked].sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("lens", "remedy"),
+    [
+        ({}, "intrinsics=focal lets it change"),
+        ({"origin": Origin.GUESS, "given": (FOCAL_PX, 0.0, 0.0)}, "intrinsics=focal lets it change"),
+        ({"origin": Origin.GUESS, "given": (900.0, 0.0, 0.0)}, "it was adjusted already"),
+        ({"model": "SIMPLE_MODEL_OF_LATER"}, ADJUSTED_ELSEWHERE),
+    ],
+)
+def test_the_remedy_for_a_wrong_lens_depends_on_what_may_still_change(lens, remedy):
+    own = Lens(**({"model": "SIMPLE_PINHOLE", "parameters": (FOCAL_PX, 0.0, 0.0), "id": 7} | lens))
+    wrong = ContradictedLens.of_lens(own, "a.jpg", (1.2, 0.01), 1, 20.0)
+    assert wrong.remedy.startswith(remedy)
+    assert wrong.remedy.endswith("calibrate that camera")
+    assert (wrong.asked_focal_px, wrong.asked_sigma_px) == pytest.approx((1.2 * FOCAL_PX, 12.0))
+    assert "its image asks for 1,200 \u00b1 12 px, not 1,000 px" in wrong.statement

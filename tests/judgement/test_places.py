@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.judgement.places import find_other_places
+from sfm_shapefit.judgement.places import AmbiguousPlace, find_other_places
 
 NAMES = tuple(f"{k}.jpg" for k in range(30))
 
@@ -75,3 +75,16 @@ def test_the_offset_of_another_place_goes_to_the_units_and_axes_of_the_output():
     x, y, z = found.offset
     assert found.moved(2.0, None).offset == (2.0 * x, 2.0 * y, 2.0 * z)
     assert found.moved(2.0, turn).offset == (-2.0 * y, 2.0 * x, 2.0 * z)
+
+
+@pytest.mark.parametrize(
+    ("num_here", "said"),
+    [
+        (0, "no pair puts 0.jpg where it is, 3 put it 5 units away"),
+        (1, "1 pair puts 0.jpg where it is, 3 put it 5 units away"),
+        (2, "2 pairs put 0.jpg where it is, 3 put it 5 units away"),
+    ],
+)
+def test_both_places_are_told_in_a_sentence(num_here, said):
+    place = AmbiguousPlace(image="0.jpg", num_here=num_here, num_there=3, offset=(3.0, 0.0, 4.0))
+    assert place.statement.startswith(said)

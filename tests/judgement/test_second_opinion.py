@@ -159,3 +159,13 @@ def test_of_a_group_those_are_named_whom_the_second_opinion_names(images):
     second = opinion_with(undecided=tuple(unlike), confirmed=confirmed)
     evidence = ModelEvidence(seams=(group_apart(*group),), second=second)
     assert {name for one in weigh_evidence(evidence, images) for name in one.images} == {*unlike}
+
+
+def test_a_camera_of_few_pairs_is_judged_by_those_of_all_that_stand_elsewhere(images):
+    every = measured(images.centers)
+    few = (every.pairs == 6).any(axis=1) & ~np.isin(every.pairs, [0, 1]).any(axis=1)
+    truth = every.subset(np.flatnonzero(~few))  # 6 has two pairs
+    wrong = moved(images, [5, 6], shift=2.0)
+    fits = [fit_pairs(one.centers, truth) for one in (wrong, images)]
+    found = compare_models(wrong, fits[0], images, fits[1], np.zeros(N, dtype=np.bool_))
+    assert rows_of(images, found.wrong) == [5, 6]

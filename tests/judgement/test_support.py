@@ -149,3 +149,15 @@ def test_it_is_named_and_can_be_kept(min_trust):
     assert name in found.verdict.cameras
     said = "kept, as min_trust=0 asks" if min_trust == 0.0 else "min_trust=0"
     assert any(name in warning and said in warning for warning in found.warnings)
+
+
+def test_what_agrees_is_counted_among_the_cameras_that_stay():
+    """Cameras that are left out for their few points were partners of the others' keypoints until then."""
+    with opened() as source:
+        state = judged_at(source)
+        seen = np.sort(seed_points(state, Clock()).points.count_seen(8))
+        options = LocateOptions(min_points_per_image=int(seen[1]) + 1)
+        found = seed_points(replace(state, inputs=replace(state.inputs, options=options)), Clock())
+    assert 3 <= found.images.is_posed.sum() <= 6
+    assert found.support.observations == shares_at(found.images, found.points)
+    assert found.support.observations.observations > 0.99

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.judgement import ties
-from sfm_shapefit.judgement.ties import NodeLinks, Rays, find_groups, links_of_pairs, rigid_groups
+from sfm_shapefit.judgement.ties import (
+    NodeLinks,
+    Rays,
+    find_groups,
+    find_hanging,
+    links_of_pairs,
+    rigid_groups,
+)
 
 RIVAL_SHARE = 6
 N = 2 * RIVAL_SHARE
@@ -144,3 +151,29 @@ def test_nothing_links_nothing():
     links = NodeLinks(np.zeros(0, dtype=int), np.zeros((0, 2), dtype=int), np.zeros(0, dtype=bool))
     group, groups = find_groups(rigid_groups(3, none, np.zeros((0, 2), dtype=int)), none, links, names_of)
     assert (group.tolist(), groups) == ([0, 1, 2], ())
+
+
+def test_a_camera_that_no_point_holds_is_in_no_piece_until_pairs_tie_it_to_one():
+    chain = [(k, k + 1, k + 2) for k in range(1, N - 2) for _ in range(15)]
+    group, _ = found(inside=chain)
+    assert len(set(group[1:])) == 1
+    assert group[0] != group[1]
+    assert len(set(found(inside=chain, agreeing=[(0, 4), (0, 5), (0, 6)])[0])) == 1
+    assert len(set(found(inside=chain, agreeing=[(0, 4), (0, 5)])[0])) == 2
+
+
+@pytest.mark.parametrize(
+    ("seen", "known", "hangs"),
+    [(0, (), True), (15, (), False), (14, (), True), (0, [(1, 7), (2, 8), (0, 7)], False)],
+)
+def test_a_group_that_a_single_pair_holds_hangs_on_the_rest(seen, known, hangs):
+    inner = [
+        (i, j) for half in (range(RIVAL_SHARE), range(RIVAL_SHARE, 9)) for i in half for j in half if i < j
+    ]
+    pairs = links_of_pairs(np.array([*inner, (0, 6)]), np.zeros((0, 2), dtype=int))
+    rays = rays_of(*[(1, 2, 7, 8)] * max(seen, 1), misses=() if seen else [0], by=range(N))
+    held = np.array(known, dtype=int).reshape(-1, 2)
+    told = [
+        (one.images, one.num_agreeing, one.is_loose) for one in find_hanging(9, rays, pairs, held, names_of)
+    ]
+    assert told == ([(("6", "7", "8"), 1, False)] if hangs else [])

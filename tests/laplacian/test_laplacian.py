@@ -1,6 +1,7 @@
 """Sparse linear algebra of graph Laplacians, against scipy's matrices and its splu."""
 
 import tracemalloc
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,7 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.laplacian import ordering
 from sfm_shapefit.laplacian.approximate import JacobiPreconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.factor import allocate_factor, analyze, factorize
+from sfm_shapefit.laplacian.front_memory import FrontMemory
 from sfm_shapefit.laplacian.operators import LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree
 from sfm_shapefit.solver.program import differences
@@ -264,6 +266,39 @@ def test_tasks_are_disjoint_subtrees_and_the_rest_is_above_them(divided):
     for begin, end in plan.tasks:  # closed: parents stay inside, up to the root
         assert (plan.parent[begin : end - 1] < end).all()
         assert not np.isin(plan.parent[:begin], np.arange(begin, end)).any()
+    units = plan.units
+    for s in np.flatnonzero(plan.parent >= 0):
+        unit, above = plan.unit_of[[s, plan.parent[s]]]
+        assert units[unit, 0] <= s < units[unit, 1]
+        assert unit == above or unit in plan.needs[above]
+    assert all(unit > max(below, default=-1) for unit, below in enumerate(plan.needs))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_update_matrices_never_overlap_while_they_wait_whatever_the_order_of_units(divided, seed):
+    plan, rng = divided[1], np.random.default_rng(seed)
+    threads = 3 if seed else 1
+    memory, areas = FrontMemory(plan, threads), np.diff(plan.row_pointers) ** 2
+    waiting, running, done = {}, {}, set[int]()
+    while len(done) < len(plan.units):
+        ready = [u for u, below in enumerate(plan.needs) if done >= {*below} and u not in done | {*running}]
+        if ready and len(running) < memory.num_arenas:
+            unit = ready[0] if threads == 1 else rng.choice(ready)
+            running[unit] = memory.room(unit, memory.leaving(unit), memory.entering(unit))
+            running[unit].__enter__()
+            waiting |= dict.fromkeys(range(*plan.units[unit]), unit)
+            placed = sorted((memory.offsets[s], memory.offsets[s] + areas[s], s) for s in waiting if areas[s])
+            assert placed[-1][1] <= memory.size
+            for (_, end, first), (begin, _, second) in pairwise(placed):
+                # In one unit a front may lie where those that it has used up were.
+                assert end <= begin or waiting[first] == waiting[second]
+        else:
+            unit = rng.choice(list(running))
+            running.pop(unit).__exit__(None, None, None)
+            done.add(unit)
+            left = {*memory.leaving(unit).tolist()}
+            used = {*memory.entering(unit).tolist()}
+            waiting = {s: u for s, u in waiting.items() if (u != unit or s in left) and s not in used}
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -302,6 +337,29 @@ def test_the_operator_multiplies_by_the_laplacian_whatever_the_threads(columns):
     np.testing.assert_array_equal(*products)
     exact = laplacian_matrix(3000, edges, w) @ x
     np.testing.assert_allclose(products[0], exact, atol=1e-7 * np.abs(exact).max() * 3)  # float32 weights
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_workers_run_jobs_once_those_that_they_need_have_ended(threads):
+    done, needs = [], [[below for below in (2 * k - 20, 2 * k - 19) if 0 <= below < k] for k in range(20)]
+    assert sum(map(len, needs)) == 19  # those of a tree
+
+    def job(k):
+        def run():
+            assert {*needs[k]} <= {*done}
+            done.append(k)
+            if k == failing:
+                raise ValueError(f"job {k}")
+
+        return run
+
+    failing = None
+    Workers(threads).run_after([job(k) for k in range(20)], needs)
+    assert sorted(done) == list(range(20))
+    done, failing = [], 12
+    with pytest.raises(ValueError, match="job 12"):
+        Workers(threads).run_after([job(k) for k in range(20)], needs)
+    assert not {k for k in range(20) if 12 in needs[k]} & {*done}
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])

@@ -14,6 +14,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.known import read_known
 from sfm_shapefit.placement.control_points import control_gauge, fit_control_points
 from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.gauge_options import GaugeOptions
 from sfm_shapefit.scene.given import ControlPoints
 from tests.models import write_priors
 from tests.scenes import RING
@@ -173,7 +174,7 @@ TWICE = [line(k, image) for k in range(4) for image in ("0001.jpg", "0002.jpg")]
             [line.replace("0.3 0.3", "11.0 95.0") for line in TWICE],
             "latitude or longitude is out",
         ),
-        ("local", [*TWICE, "1 2 nan 3 4 0001.jpg P9"], "line 10: coordinates must be finite, and all three"),
+        ("local", [*TWICE, "1 2 nan 3 4 0001.jpg P9"], "line 10: numbers must be finite, and all of them"),
         ("local", [*TWICE, "1 2 3 4 0001.jpg"], "line 10: expected x y z, two pixel coordinates"),
         ("local", [*TWICE, TWICE[0]], "line 10: P0 is marked twice in 0001.jpg; keep one of its marks"),
         ("local", [*TWICE, line(1, "0003.jpg", "P0")], "line 10: P0 has other coordinates than in line 2"),
@@ -200,7 +201,7 @@ TWICE = [line(k, image) for k in range(4) for image in ("0001.jpg", "0002.jpg")]
 def test_a_file_that_cannot_serve_is_refused(ring, tmp_path, projection, lines, said):
     path = written(tmp_path, lines, projection)
     with pytest.raises(InputError, match=path.replace(".", r"\.")) as refused:
-        read_known(read_model(ring).images, None, control_points=path)
+        read_known(read_model(ring).images, None, gauge=GaugeOptions(control_points=path))
     assert said in str(refused.value)
 
 
@@ -213,9 +214,7 @@ def test_an_empty_file_is_refused(ring, tmp_path):
 def test_points_that_cannot_be_triangulated_leave_the_model_as_it_is(ring, tmp_path):
     found = sfm_shapefit.locate(ring, RING / "database.db", control_points=written(tmp_path, TWICE))
     assert found.gauge.scale == "input"
-    assert any(
-        "the model does not stand in the axes of the control points" in said for said in found.warnings
-    )
+    assert any("the model is not in the axes of the control points" in said for said in found.warnings)
     assert {row["use"] for row in found.summary()["control_points"]} == {"unused"}
 
 

@@ -1,31 +1,30 @@
-"""Directions measured by other processes equal those of one; a worker that dies is replaced or reported."""
+"""The workers of a dask scheduler change no bit, however many, and whichever dies; what they lack is told."""
 
 import dataclasses
 import os
 import signal
-import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 
 import numpy as np
 import pytest
 
+import sfm_shapefit
+from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.executors import Crew, WorkerError
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.pair_directions import concatenate
-from sfm_shapefit.pipeline.execution import (
-    WorkerError,
-    interrupts_wait,
-    measure_part,
-    measure_with_workers,
-    open_executor,
-)
-from tests.program import run_python
-from tests.scenes import view_of
+from sfm_shapefit.pipeline.execution import DaskWorkers, measure_with_workers
+from tests.adjustment.made import disturb
+from tests.adjustment.test_iterative import make_wall
+from tests.clusters import client_of
+from tests.program import run, run_refused
+from tests.scenes import COURTYARD, RING, view_of
+
+RING_MODEL, RING_DATABASE = RING / "sparse" / "0", RING / "database.db"
 
 
 @pytest.fixture(scope="module")
@@ -36,17 +35,26 @@ def model(tiny_ring):
 ESTIMATE = partial(estimate_directions, options=DirectionOptions())
 
 
-def serial(tiny_ring, model):
-    with view_of(tiny_ring / "database.db", model.images) as view:
-        (part,) = view.parts(10**9)
-    (found,) = measure_part(ESTIMATE, 1, part)
-    return found
+@dataclasses.dataclass
+class Counting:
+    """Workers that note what they are asked to do, and of which the first leaves before some task."""
+
+    workers: DaskWorkers
+    leaves_at: int = -1
+    asked: list = dataclasses.field(default_factory=list)
+
+    def submit(self, work, *given):
+        if len(self.asked) == self.leaves_at:
+            cluster = self.workers.client.cluster
+            cluster.sync(cluster.workers[min(cluster.workers)].close, timeout=0, executor_wait=False)
+        self.asked.append(work.__name__)
+        return self.workers.submit(work, *given)
 
 
-def shared(tiny_ring, model, executor, estimate=ESTIMATE):
+def measured(tiny_ring, model, cluster, estimate=ESTIMATE):
     seen = []
     with view_of(tiny_ring / "database.db", model.images) as view:
-        clock = Clock(lambda _stage, *done: seen.append(done), executor=executor)
+        clock = Clock(lambda _stage, *done: seen.append(done), cluster=cluster)
         parts = measure_with_workers(view, estimate, clock, matches_per_task=700)
     return concatenate(parts), seen
 
@@ -60,32 +68,57 @@ def assert_same_bits(a, b):
             np.testing.assert_array_equal(ours, theirs, err_msg=field.name)
 
 
-def test_directions_of_threads_in_parts_equal_those_of_one_pass_to_the_bit(tiny_ring, model):
-    with ThreadPoolExecutor(2) as pool:
-        found, seen = shared(tiny_ring, model, pool)
-    assert_same_bits(found, serial(tiny_ring, model))
+def test_directions_of_workers_in_parts_equal_those_of_one_pass_to_the_bit(tiny_ring, model, dask_client):
+    cluster = Counting(DaskWorkers(dask_client))
+    found, seen = measured(tiny_ring, model, cluster)
+    with view_of(tiny_ring / "database.db", model.images) as view:
+        assert_same_bits(found, concatenate([ESTIMATE(batch) for batch in view.batches()]))
     assert seen[-1] == (len(found.pairs), len(found.pairs))
+    assert cluster.asked.count("measure_part") > 3
 
 
-def _die(*_given):
-    os._exit(1)
+def refuse(_batch):
+    raise InputError("the database is damaged")
+
+
+def lack(_batch):
+    raise MemoryError("no room\nand more")
+
+
+def test_what_the_input_lacks_passes_as_it_is_and_what_a_worker_lacks_is_told(tiny_ring, model, dask_client):
+    with pytest.raises(InputError, match="the database is damaged"):
+        measured(tiny_ring, model, DaskWorkers(dask_client), refuse)
+    with pytest.raises(WorkerError, match=r"the workers failed \(no room\); look at their logs"):
+        measured(tiny_ring, model, DaskWorkers(dask_client), lack)
+
+
+def columns(adjusted):
+    solved = adjusted.problem
+    return solved.centers, solved.rotations, solved.points, adjusted.costs
+
+
+@pytest.mark.parametrize(("workers", "leaves_at"), [(1, -1), (3, -1), (3, 14)])
+def test_an_adjustment_in_parts_is_the_same_for_any_number_of_workers_one_of_which_dies(workers, leaves_at):
+    start = disturb(make_wall((20, 30)), np.random.default_rng(1), center=0.01, rotation_rad=1e-3, point=0.01)
+    steps = {"max_iterations": 2, "settles_points": True}
+    here = adjust(start, crew=Crew(1), **steps)
+    with client_of(workers) as client:
+        cluster = Counting(DaskWorkers(client), leaves_at)
+        there = adjust(start, crew=Crew(2, cluster), **steps)
+        assert len(client.scheduler_info()["workers"]) == workers - (leaves_at >= 0)
+    assert cluster.asked.count("lay_out") == 3
+    for ours, theirs in zip(columns(here), columns(there), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.slow
-def test_a_worker_that_dies_in_a_pool_is_reported(tiny_ring, model):
-    with (
-        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
-        pytest.raises(WorkerError, match=r"a worker failed .* run again"),
-    ):
-        shared(tiny_ring, model, pool, _die)
-
-
-def test_an_error_of_the_input_passes_as_it_is(tiny_ring, model):
-    def refuse(*_given):
-        raise InputError("the database is damaged")
-
-    with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="the database is damaged"):
-        shared(tiny_ring, model, pool, refuse)
+def test_a_process_that_is_killed_is_replaced(tiny_ring, model, tmp_path):
+    flag, alone = tmp_path / "killed", ESTIMATE
+    with client_of(2, processes=True) as client:
+        found, _ = measured(tiny_ring, model, DaskWorkers(client), partial(die_once, str(flag)))
+    assert flag.exists()
+    with view_of(tiny_ring / "database.db", model.images) as view:
+        assert_same_bits(found, concatenate([alone(batch) for batch in view.batches()]))
 
 
 def die_once(flag, batch):
@@ -93,70 +126,83 @@ def die_once(flag, batch):
     try:
         os.close(os.open(flag, os.O_CREAT | os.O_EXCL))
     except FileExistsError:
-        time.sleep(0.05)
         return ESTIMATE(batch)
-    os._exit(1)
+    return os.kill(os.getpid(), signal.SIGKILL)
 
 
-@pytest.mark.slow
-def test_dask_gives_the_work_of_a_killed_worker_to_another(tiny_ring, model, tmp_path):
-    pytest.importorskip("distributed")
-    flag = tmp_path / "killed"
-    with open_executor("dask", 2) as pool:
-        found, _ = shared(tiny_ring, model, pool, partial(die_once, str(flag)))
-    assert flag.exists()
-    assert_same_bits(found, serial(tiny_ring, model))
+def files_of(folder):
+    """Return the bytes of the files of a model and its tables; JSON has timings."""
+    return {one.name: one.read_bytes() for one in folder.rglob("*") if one.suffix in (".bin", ".csv")}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["processes", "dask"])
-def test_an_interrupt_of_all_processes_is_the_business_of_the_first_one(kind):
-    if kind == "dask":
-        pytest.importorskip("distributed")
-    script = """
-import os, signal, sys, time
-os.setsid()
-from sfm_shapefit.pipeline.execution import open_executor
-try:
-    with open_executor(sys.argv[1], 2) as pool:
-        list(pool.map(abs, range(20)))  # all workers are there, and wait
-        os.killpg(os.getpgrp(), signal.SIGINT)  # as a terminal does
-        time.sleep(60)
-except KeyboardInterrupt:
-    sys.exit(130)
-"""
-    done = run_python("-c", script, kind)
-    assert (done.returncode, done.stderr) == (130, "")
+@pytest.mark.parametrize(("command", "source"), [("locate", RING_MODEL), ("map", RING_DATABASE)])
+def test_a_command_with_a_scheduler_writes_the_same_bytes(command, source, tmp_path, dask_client):
+    address = dask_client.cluster.scheduler_address
+    run(command, source, tmp_path / "there", "--scheduler", address, "--no-report", "-q", code=0)
+    run(command, source, tmp_path / "here", "--no-report", "-q", code=0)
+    here = files_of(tmp_path / "here")
+    assert {"images.bin", "points3D.bin", "cameras.csv", "pairs.csv"} <= set(here)
+    assert files_of(tmp_path / "there") == here
 
 
-def test_an_interrupt_while_a_cluster_opens_comes_when_it_can_be_closed():
-    done, before = [], signal.getsignal(signal.SIGINT)
+def test_adjustments_in_parts_for_memory_write_the_same_bytes_with_a_scheduler(tmp_path, dask_client):
+    limit = int(sfm_shapefit.inspect(RING_MODEL).expected.peak_mb)
+    found, alone = (
+        sfm_shapefit.locate(RING_MODEL, max_memory_mb=limit, client=client) for client in (dask_client, None)
+    )
+    (said,) = (text for text in alone.warnings if text.startswith("to stay below"))
+    assert "adjustments go part by part" in said
+    assert "not adjusted" not in said
+    for result, name in ((found, "there"), (alone, "here")):
+        result.write(tmp_path / name, report=False)
+    assert files_of(tmp_path / "there") == files_of(tmp_path / "here")
 
-    def open_cluster():
-        with interrupts_wait():
-            signal.raise_signal(signal.SIGINT)
-            done.append(1)
 
-    with pytest.raises(KeyboardInterrupt):
-        open_cluster()
-    assert done == [1]
-    assert signal.getsignal(signal.SIGINT) is before
+def test_no_scheduler_at_an_address_is_told_in_a_sentence(tmp_path):
+    said = run_refused("locate", RING_MODEL, tmp_path / "out", "--scheduler", "nonsense://1", "-q")
+    assert "the dask scheduler nonsense://1 cannot be reached; check its address" in said
+    assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
-def test_a_second_cluster_on_a_machine_opens_without_a_word_and_one_is_found_by_its_address(recwarn):
-    distributed = pytest.importorskip("distributed")
+def test_a_scheduler_that_is_gone_is_told(tiny_ring, model):
+    with client_of(1) as client:
+        client.close()
+        with pytest.raises(WorkerError, match=r"the workers failed \(Client is closed.* look at their logs"):
+            measured(tiny_ring, model, DaskWorkers(client))
+
+
+def test_a_scheduler_without_workers_is_told():
     with (
-        open_executor("dask", 1) as first,
-        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0") as other,
-        open_executor(f"dask:{other.scheduler_address}", 1) as found,
+        client_of(0) as client,
+        pytest.raises(WorkerError, match="has no worker; start one"),
     ):
-        assert [pool.submit(abs, -2).result() for pool in (first, found)] == [2, 2]
-        assert found.submit(os.getpid).result() in {worker.pid for worker in other.workers.values()}
-    assert [str(warning.message) for warning in recwarn if "Port" in str(warning.message)] == []
+        sfm_shapefit.map_database(COURTYARD / "database.db", client=client)
 
 
-def test_no_scheduler_at_an_address_is_reported():
-    pytest.importorskip("distributed")
-    with pytest.raises(WorkerError, match="cannot be reached"), open_executor("dask:nonsense://1", 1):
-        pass
+class Elsewhere:
+    """A client one of whose workers is on a machine where something is otherwise."""
+
+    def __init__(self, change):
+        self.change = change
+
+    def run(self, look, path, **_options):
+        return {"tcp://a": look(path), "tcp://b": self.change(look(path))}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda seen: seen._replace(size=seen.size + 1), "does not see .*database.db as it is here; share"),
+        (lambda seen: seen._replace(modified_ns=0), "does not see .*database.db as it is here; share"),
+        (lambda seen: seen._replace(version="0"), "has sfm_shapefit 0; install version"),
+        (lambda _seen: ModuleNotFoundError("sfm_shapefit"), "has no sfm_shapefit; install version"),
+    ],
+)
+def test_a_worker_that_lacks_the_database_or_the_package_is_named_before_anything_is_measured(change, words):
+    with pytest.raises(WorkerError, match=f"the worker tcp://b {words}"):
+        sfm_shapefit.locate(RING_MODEL, RING_DATABASE, client=Elsewhere(change))
+
+
+def test_the_option_before_is_answered(tmp_path):
+    said = run("locate", RING_MODEL, tmp_path / "out", "--executor", "processes", code=2).output
+    assert "--executor is gone: threads share all work; for other machines there is --scheduler" in said

@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import numpy as np
 import pycolmap
@@ -231,16 +229,15 @@ def test_what_map_cannot_be_told_is_refused_in_one_sentence(tmp_path, flags, wor
     assert list(tmp_path.iterdir()) == []
 
 
-def test_pairs_that_are_to_be_left_out_take_no_part_anywhere_nor_in_an_executor(tmp_path):
+def test_pairs_that_are_to_be_left_out_take_no_part_anywhere_nor_with_workers(tmp_path, dask_client):
     truth = read_model(RING / "sparse" / "0").images
     listed, ids = [(0, 1), (4, 3)], truth.ids.tolist()
     gone = [f"pair_id = {ids[min(pair)] * PAIR + ids[max(pair)]}" for pair in listed]
     without = tmp_path / "without.csv"
     without.write_text("\n".join(f"{truth.names[i]},{truth.names[j]}" for i, j in listed))
     database = changed(RING, tmp_path / "edited", f"{PAIRS} {' OR '.join(gone)}")
-    with ThreadPoolExecutor(2) as pool:
-        left_out = {"without": str(without), "executor": pool}
-        given = sfm_shapefit.map_database(RING / "database.db", **left_out, **FAST).models[0]
+    left_out = {"without": str(without), "client": dask_client}
+    given = sfm_shapefit.map_database(RING / "database.db", **left_out, **FAST).models[0]
     gone = sfm_shapefit.map_database(database, **FAST).models[0]
     np.testing.assert_array_equal(given.directions.pairs, gone.directions.pairs)
     assert len(given.directions.pairs) > 0
@@ -248,31 +245,17 @@ def test_pairs_that_are_to_be_left_out_take_no_part_anywhere_nor_in_an_executor(
     np.testing.assert_array_equal(*centers)
 
 
-def test_pairs_of_fixed_images_are_left_out_in_an_executor_too(tmp_path):
+def test_pairs_of_fixed_images_are_left_out_with_workers_too(tmp_path, dask_client):
     model, database, names = RING / "sparse" / "0", RING / "database.db", tmp_path / "names.txt"
     fixed = read_model(model).images.names[:3]
     names.write_text("\n".join(fixed))
-    with ThreadPoolExecutor(2) as pool:
-        shared = sfm_shapefit.locate(model, database, fix=str(names), executor=pool)
+    shared = sfm_shapefit.locate(model, database, fix=str(names), client=dask_client)
     alone = sfm_shapefit.locate(model, database, fix=str(names))
     assert len(shared.directions.pairs) > 0
     assert not np.isin(shared.directions.pairs, range(3)).all(axis=1).any()
     np.testing.assert_array_equal(shared.directions.pairs, alone.directions.pairs)
     centers = [found.table("cameras")["x"] for found in (shared, alone)]
     np.testing.assert_array_equal(*centers)
-
-
-class Counting(ThreadPoolExecutor):
-    """Counts the tasks of each kind."""
-
-    def __init__(self, workers):
-        super().__init__(workers)
-        self.tasks = {}
-
-    def submit(self, work, /, task):
-        kind = work.args[0].func.__name__ if isinstance(work, partial) else work.__name__
-        self.tasks[kind] = self.tasks.get(kind, 0) + 1
-        return super().submit(work, task)
 
 
 def assert_same_bits(shared, serial, folder):
@@ -287,11 +270,8 @@ def assert_same_bits(shared, serial, folder):
         assert (folder / "shared" / "0" / name).read_bytes() == (folder / "serial" / "0" / name).read_bytes()
 
 
-def test_an_executor_shares_out_pairs_and_changes_no_bit(tmp_path, courtyard_mapped):
-    with Counting(2) as pool:
-        shared = sfm_shapefit.map_database(COURTYARD / "database.db", executor=pool)
-    assert set(pool.tasks) == {"estimate_relative_rotations", "estimate_directions"}
-    assert pool.tasks["estimate_directions"] == 2  # of the averaged rotations and of the adjusted ones
+def test_workers_change_no_bit(tmp_path, courtyard_mapped, dask_client):
+    shared = sfm_shapefit.map_database(COURTYARD / "database.db", client=dask_client)
     assert_same_bits(shared, courtyard_mapped, tmp_path)
 
 
@@ -387,7 +367,7 @@ def test_components_become_models_of_their_own_and_single_images_are_named(tmp_p
     others = {row.name for row in found.cameras if not row.placed} - set(found.models[0].not_placed)
     assert others <= {row.name for row in found.models[1].cameras if row.placed}
     assert found.models[0].verdict.statement == "good"
-    assert found.verdict.statement == "look: 43% of the images stand in another model"
+    assert found.verdict.statement == "look: 43% of the images are in another model"
     sfm_shapefit.write_result(found, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
 
@@ -476,7 +456,7 @@ def test_a_second_rigid_piece_is_a_model_and_what_keeps_it_apart_is_told(tmp_pat
     # The images of the other are not missing in either, but not there: neither is all of the scene.
     verdicts = [model.verdict for model in found.models]
     assert [verdict.grade for verdict in verdicts] == ["look", "look"]
-    assert all("of the images stand in another model" in verdict.reasons[-1] for verdict in verdicts)
+    assert all("of the images are in another model" in verdict.reasons[-1] for verdict in verdicts)
     (told,) = found.joins
     assert "1 pair of images cannot tell how large it is and where" in told.reason
     sfm_shapefit.write_result(found, tmp_path / "out")

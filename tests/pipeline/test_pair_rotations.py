@@ -1,8 +1,7 @@
-"""`relative_rotations`: the same by threads and by any executor, and bad input refused in a sentence."""
+"""`relative_rotations`: the same by threads and by workers, and bad input refused in a sentence."""
 
 import dataclasses
 import struct
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -58,7 +57,7 @@ def crowded(tmp_path_factory):
     return folder / "database.db", read_model(folder / "sparse" / "0").images
 
 
-def test_of_very_many_pairs_those_not_tried_for_are_found_near_their_average(crowded):
+def test_of_very_many_pairs_those_not_tried_for_are_found_near_their_average(crowded, dask_client):
     database, truth = crowded
     found = sfm_shapefit.relative_rotations(database, threads=1)
     assert len(found.pairs) > 25 * 56
@@ -68,8 +67,7 @@ def test_of_very_many_pairs_those_not_tried_for_are_found_near_their_average(cro
     assert np.median(off_deg) < 0.1
     assert np.mean(off_deg < 1.0) > 0.98
     assert_same_bits(sfm_shapefit.relative_rotations(database, threads=2), found)
-    with ThreadPoolExecutor(2) as pool:
-        assert_same_bits(sfm_shapefit.relative_rotations(database, executor=pool), found)
+    assert_same_bits(sfm_shapefit.relative_rotations(database, client=dask_client), found)
 
 
 @pytest.mark.parametrize("threads", [0, 2])
@@ -77,13 +75,11 @@ def test_threads_change_no_bit(found, threads):
     assert_same_bits(sfm_shapefit.relative_rotations(str(DATABASE), threads=threads), found)
 
 
-def test_an_executor_changes_no_bit(found):
+def test_workers_change_no_bit(found, dask_client):
     seen = []
-    with ThreadPoolExecutor(2) as pool:
-        shared = sfm_shapefit.relative_rotations(
-            DATABASE, executor=pool, progress=lambda *now: seen.append(now)
-        )
-        many = sfm_shapefit.relative_rotations(DATABASE, executor=pool, min_matches=60)
+    tell = {"progress": lambda *now: seen.append(now)}
+    shared = sfm_shapefit.relative_rotations(DATABASE, client=dask_client, **tell)
+    many = sfm_shapefit.relative_rotations(DATABASE, client=dask_client, min_matches=60)
     assert_same_bits(shared, found)
     assert_same_bits(many, found.subset(found.num_matches >= 60))
     assert {stage for stage, _, _ in seen} == {"relative rotations"}

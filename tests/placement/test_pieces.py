@@ -15,6 +15,7 @@ from sfm_shapefit.base.geometry import (
 )
 from sfm_shapefit.placement.coinciding import count_coinciding
 from sfm_shapefit.placement.join import UNTIED, PieceJoin, join_pieces
+from sfm_shapefit.placement.piece_program import Residuals, Standing, misses_px
 from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
 from sfm_shapefit.placement.prior_join import join_by_priors, place_by_priors
 from sfm_shapefit.scene.given import PositionPriors
@@ -129,6 +130,33 @@ class Drawn:
 def is_right(drawn, join):
     scale, turn, apart = drawn.off(join)
     return not join.reason and scale < 0.003 and turn < 0.2 and apart < 0.03
+
+
+def test_misses_are_angles_to_points_and_distances_from_planes_in_pixels():
+    rng, count = np.random.default_rng(0), 40
+    standing = Standing(
+        scales=np.array([1.0, 2.0, 0.5]), turns=Rotation.random(3, random_state=0).as_matrix(),
+        middles=rng.normal(size=(3, 3)),
+    )  # fmt: skip
+    pieces = np.stack([np.arange(count) % 3, (np.arange(count) + 1) % 3], axis=1)
+    eyes, targets = rng.normal(size=(2, count, 3))
+    looks, others = normalized(rng.normal(size=(2, count, 3)))
+    others[::2] = np.nan
+    found = misses_px(
+        Residuals(pieces, np.zeros(count, int), eyes, looks, targets, others, np.full(count, PIXEL)), standing
+    )
+    for k, (i, j) in enumerate(pieces):
+        eye, target = (
+            standing.scales[g] * standing.turns[g] @ x + standing.middles[g]
+            for g, x in ((i, eyes[k]), (j, targets[k]))
+        )
+        across, look = normalized(target - eye), standing.turns[i] @ looks[k]
+        expected = np.linalg.norm(across - look)
+        if k % 2:
+            other = standing.turns[j] @ others[k]
+            sines = [np.linalg.norm(np.cross(across, ray)) for ray in (look, other)]
+            expected = abs(np.linalg.det([look, other, across])) / min(sines)
+        assert found[k] == pytest.approx(expected / PIXEL, rel=1e-12)
 
 
 @pytest.mark.parametrize("known", [True, False])

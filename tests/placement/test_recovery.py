@@ -86,3 +86,17 @@ def test_the_oracle_is_a_least_squares_fit():
     rng = np.random.default_rng(0)
     for _ in range(20):
         assert cost(best + 1e-3 * rng.standard_normal(best.shape)) > cost(best)
+
+
+@pytest.mark.slow
+def test_a_large_graph_without_order_is_refined_without_a_factor():
+    """Its factor would take a third of a second a step; of two starts that are near only one is refined."""
+    many = synthetic.random_graph_problem(1420, 22 / 1420, sigma=0.015, q=0.1, seed=1)
+    placed = place(many.view_graph)
+    refined = placed.refined
+    assert refined.lud is not None
+    assert list(refined.costs) == ["ShapeFit"]
+    assert 0.01 < refined.disagreement < 0.1  # below 1,500 cameras or so both would be refined
+    assert refined.is_refined
+    ours, start = (shape_error(t, many.locations) for t in (placed.locations, placed.certified.locations))
+    assert ours < 0.7 * start

@@ -12,6 +12,7 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.factor import analyze, factorize
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement.length_prior import LengthPrior
+from sfm_shapefit.refinement.mixture import Mixture
 from tests.graph_families import random_blocks
 from tests.problems import no_mixture, shape_error
 
@@ -147,6 +148,19 @@ def test_the_answer_is_the_same_to_the_bit_for_any_number_of_threads(on_street):
         again = place(graph, threads=threads)
         np.testing.assert_array_equal(again.locations, found.locations)
         np.testing.assert_array_equal(again.refined.variances, found.refined.variances)
+
+
+def test_more_pairs_than_one_thread_takes_at_a_time_end_in_the_same_bits_near_the_truth():
+    problem = corrupted(0.2, 2, n=200, sigma=0.005)
+    graph = problem.view_graph
+    assert graph.num_edges > 8192
+    ends = []
+    for threads in (1, 3):
+        model = Mixture(MeasuredGraph(graph), analyze(graph.num_nodes, graph.edges), threads)
+        ends.append(model.descend(problem.locations))
+    for name in ("locations", "variances", "posterior", "bound"):
+        np.testing.assert_array_equal(*(getattr(end, name) for end in ends))
+    assert shape_error(ends[0].locations, problem.locations) < 0.005  # noise over the root of 50 pairs a node
 
 
 def test_names_and_senses_of_pairs_do_not_matter(on_street):

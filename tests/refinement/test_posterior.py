@@ -15,7 +15,7 @@ def corrupted(q=0.6, sigma=0.02, d=3, n=60):
     return synthetic.random_graph_problem(n, 0.5, d=d, sigma=sigma, q=q, seed=3)
 
 
-@pytest.mark.parametrize(("d", "least"), [(2, 0.6), (3, 0.9), (4, 0.9)])
+@pytest.mark.parametrize(("d", "least"), [(2, 0.6), (3, 0.9), (4, 0.9), (16, 0.9), (150, 0.8)])
 def test_right_pairs_are_told_from_wrong_ones_in_any_dimension(d, least):
     problem = corrupted(q=0.3 if d == 2 else 0.6, d=d)
     wrong, posterior = problem.corrupted, weigh_by_triangles(problem.view_graph).posterior

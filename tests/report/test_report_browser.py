@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.report.page import write_report
+from sfm_shapefit.report.matched import DrawnMatches
+from sfm_shapefit.report.page import Pictures, write_report
 from tests.browser import chromium, complaints, opened, requests, wait_for
 from tests.drawings import make_drawing
 from tests.report.test_report_page import HOSTILE, doubted
@@ -108,7 +109,7 @@ def test_the_report_opens_without_errors_and_without_the_network(driver, report)
     assert drawn == ["trust", "histogram", "tracks", "reprojection", "matrix", "support", "convergence"]
     assert driver.execute_script(COLORS)["count"] > 50
     assert "workspace" in driver.find_element("id", "command").text
-    assert str(report.parent) in driver.find_element("id", "command").text
+    assert driver.find_element("id", "command").text == "sfm-shapefit workspace OUT IMAGES OUT_dense"
 
 
 def test_a_click_on_a_row_chooses_its_camera_flies_there_and_the_scene_stays_in_view(driver, report):
@@ -313,12 +314,11 @@ def test_thumbnails_stand_in_the_frusta_and_beside_the_facts_and_what_is_left_ou
     drawing, facts = make_drawing()
     encoded = cv2.imencode(".jpg", np.full((24, 32, 3), (0, 0, 255), dtype=np.uint8))[1].tobytes()
     picture = f"data:image/jpeg;base64,{base64.b64encode(encoded).decode()}"
-    write_report(drawing, facts, tmp_path / "report.html", dict.fromkeys(range(25), picture))
+    pictures = Pictures(dict.fromkeys(range(25), picture))
+    write_report(drawing, facts, tmp_path / "report.html", pictures)
     opened(driver, tmp_path / "report.html")
     assert wait_for(driver, "return document.getElementById('canvas').dataset.pictures") == "24"
     assert driver.execute_script(COLORS)["red"] > 500
-    click(driver, "#cameras tbody tr")
-    assert driver.execute_script("return document.querySelector('#details img').naturalWidth") == 32
     ghost = driver.find_element("css selector", "[data-layer=ghosts]")
     assert ghost.find_element("xpath", "..").text == "Left out (1)"
     driver.execute_script(
@@ -329,6 +329,57 @@ def test_thumbnails_stand_in_the_frusta_and_beside_the_facts_and_what_is_left_ou
     middle = np.median(drawing.cameras.centers[drawing.cameras.placed], axis=0)
     np.testing.assert_allclose(target, drawing.axes @ (drawing.cameras.poses.centers[24] - middle), atol=1e-5)
     assert complaints(driver) == []
+
+
+SHOWN = "return document.querySelectorAll('.beside image').length === 2 && document.querySelector('.beside')"
+
+
+def test_a_picture_stands_beside_that_of_another_camera_with_the_matches_of_the_pair(driver, tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    drawing, facts = make_drawing()
+    encoded = cv2.imencode(".jpg", np.zeros((24, 32, 3), dtype=np.uint8))[1].tobytes()
+    picture = f"data:image/jpeg;base64,{base64.b64encode(encoded).decode()}"
+    ends = drawing.pairs.cameras
+    own = np.flatnonzero((ends == 3).any(axis=1) & drawing.cameras.placed[ends].all(axis=1))[:3]
+    # The first has most matches, most of the second contradict; each draws one of either kind.
+    corners = np.tile([[0, 0, 65535, 65535], [65535, 0, 0, 65535]], (3, 1))
+    counts = np.array([[50, 1], [3, 20], [1, 1]])
+    matches = DrawnMatches(own, counts, np.ones((3, 2), dtype=np.int64), corners)
+    pictures = Pictures(dict.fromkeys(range(25), picture), matches)
+    write_report(drawing, facts, tmp_path / "report.html", pictures)
+    opened(driver, tmp_path / "report.html")
+    names = drawing.cameras.names
+    driver.find_element("css selector", "#cameras input").send_keys(names[3])
+    click(driver, "#cameras tbody tr")
+
+    def beside(pair):
+        text = wait_for(driver, SHOWN).text
+        other = names[ends[pair].sum() - 3]
+        assert f"Beside {other}: " in text
+        return text, driver.execute_script(
+            "return [...document.querySelectorAll('.beside .match')].map((one) => one.getAttribute('d'))"
+        )
+
+    told, lines = beside(own[1])
+    assert "2 of 23 matches drawn: 3 fit, 20 contradict" in " ".join(told.split())
+    swapped = ends[own[1], 0] != 3  # the chosen camera is on the left; pictures are 100 wide, 2 apart
+    fits, contradicts = ("M100.0 75.0L102.0 0.0", "M0.0 75.0L202.0 0.0")
+    straight = ("M0.0 0.0L202.0 75.0", "M100.0 0.0L102.0 75.0")
+    assert lines == list((fits, contradicts) if swapped else straight)
+    for _ in range(3):  # the keys go through the pairs, the facts stay those of the camera
+        driver.execute_script(
+            "const item = document.querySelector('#details li[aria-current=true] button');"
+            "const key = new KeyboardEvent('keydown', {key: arguments[0], bubbles: true, cancelable: true});"
+            "item.dispatchEvent(key);",
+            "ArrowDown" if _ < 2 else "ArrowUp",
+        )
+    current = driver.find_element("css selector", "#details li[aria-current=true]").text
+    assert f"Beside {current.split()[0]}" in wait_for(driver, SHOWN).text
+    assert driver.find_element("css selector", "#details h3").text == names[3]
+    click(driver, ".beside .link")
+    assert driver.find_element("css selector", "#details h3").text == current.split()[0]
+    assert complaints(driver) == []
+    assert requests(driver) == []
 
 
 # Turns the scene for ten frames; returns the calls of WebGL, the largest array that is handed over, and how

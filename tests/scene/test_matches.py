@@ -181,7 +181,7 @@ def test_parts_are_read_elsewhere_to_the_same_bits(tiny_ring, model):
             assert sum(part.num_pairs for part in parts) == whole.num_pairs
             found = []
             for part in parts:
-                with part.open() as view:
+                with part.open(model.images) as view:
                     found += view.batches()
             assert_same_bits(columns(found), expected)
         assert len(whole.parts(1)) == whole.num_pairs

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.adjustment.solve import adjust, choose_loss_scale_px
-from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.thin_tracks import choose_thin_tracks
 from sfm_shapefit.tracks.triangulation import (
     PointLimits,
@@ -230,9 +230,6 @@ def test_without_chains_matches_are_joined_once():
 
 
 def test_tracks_of_points_are_the_rows_that_see_each():
-    rows = JoinedRows(np.array([0, 3, 5]), np.array([70, 60, 50, 40, 30]))
-    offsets, of_points = rows.of_points(np.array([1, -1, 0, 0, 1]))
-    assert (offsets.tolist(), of_points.tolist()) == ([0, 2, 4], [50, 40, 70, 30])
     tracks = made()[0].subset(np.array([2, 0]))
     own = np.repeat([0, 1], tracks.lengths())
     assert tracks.of_points(own).pixels is tracks.pixels  # nothing is copied

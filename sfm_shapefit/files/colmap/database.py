@@ -238,14 +238,13 @@ class DatabaseMatches(Matches):
 
     def parts(self, view: View, ranges: Sequence[slice]) -> "list[DatabasePart]":
         """Return ranges of a view's pairs for other processes."""
-        path, images = Path(os.path.abspath(self.file.path)), view.images
+        path = Path(os.path.abspath(self.file.path))
         return [
             DatabasePart(
                 path=path,
                 sound=Sound(
                     rows_taken(self.rows, view.rows[part])._replace(pairs=view.pairs[part]), self._broken
                 ),
-                images=images,
             )
             for part in ranges
         ]
@@ -262,14 +261,12 @@ class DatabaseMatches(Matches):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DatabasePart:
-    """Some pairs of a view, and all that is needed to read them elsewhere: see `MatchPart`."""
+    """Some pairs of a view, and where they are to be read elsewhere: see `MatchPart`."""
 
     path: Path
     """Absolute path of the database; it must be the same for all workers."""
     sound: Sound
     """Where in it the pairs are: to find that out anew takes longer, the more pairs the database has."""
-    images: Images
-    """All images of the view, to which pairs refer: without rotations and cameras matches are no rays."""
 
     @property
     def num_pairs(self) -> int:
@@ -277,7 +274,7 @@ class DatabasePart:
         return len(self.sound.rows.pairs)
 
     @contextmanager
-    def open(self) -> Iterator[View]:
-        """Open the database again, for these pairs alone, nothing of which is kept."""
-        with closing(open_database(self.path, self.images.names, self.sound)) as matches:
-            yield matches.at(self.images, reading=Reading(keeps=False))
+    def open(self, images: Images) -> Iterator[View]:
+        """Open the database again, for the images of the view and these pairs, nothing of which is kept."""
+        with closing(open_database(self.path, images.names, self.sound)) as matches:
+            yield matches.at(images, reading=Reading(keeps=False))

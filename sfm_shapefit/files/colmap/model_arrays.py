@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, UInt32Array, UInt64Array
+from sfm_shapefit.base.lists import Lists, offsets_of
 from sfm_shapefit.files.colmap.binary_records import NO_POINT, POINT2D, POINT3D
 from sfm_shapefit.scene.lens import Lens
 
@@ -86,7 +87,7 @@ class ImageRecords(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ModelArrays:
+class ModelArrays(Lists):
     """A COLMAP model; nobody modifies one."""
 
     lenses: tuple[Lens, ...]
@@ -96,8 +97,8 @@ class ModelArrays:
     rigs: tuple[RigRecord, ...]
     frames: FrameRecords
     images: ImageRecords
-    starts: IntArray
-    """(i + 1,) where the keypoints of each image begin, and their end."""
+    offsets: IntArray
+    """(i + 1,) the keypoints of image i are the rows offsets[i]:offsets[i + 1] of `points2d`."""
     points2d: Records
     """(k,) keypoints as `POINT2D`."""
     points: Records
@@ -121,7 +122,7 @@ class ModelArrays:
             rigs=tuple(trivial_rig(lens.id) for lens in lenses),
             frames=FrameRecords(images.ids, images.camera_ids, poses, data),
             images=images._replace(frame_of=np.arange(len(images.ids))),
-            starts=np.zeros(len(images.ids) + 1, dtype=np.int64),
+            offsets=np.zeros(len(images.ids) + 1, dtype=np.int64),
             points2d=np.zeros(0, POINT2D),
             points=np.zeros(0, POINT3D),
             tracks=np.zeros((0, 2), np.uint32),
@@ -129,7 +130,7 @@ class ModelArrays:
 
     def keypoints(self, row: int) -> Records:
         """Return the keypoints of an image by its row."""
-        return self.points2d[self.starts[row] : self.starts[row + 1]]
+        return self.points2d[self.slice_of(row)]
 
     def observed(self, row: int) -> tuple[IntArray, UInt64Array]:
         """Return which keypoints of an image observe a point, ascending, and the ids of the points."""
@@ -157,14 +158,14 @@ class ModelArrays:
 
     def point_blocks(self) -> Iterator[tuple[Records, UInt32Array]]:
         """Yield points with their tracks, `AT_ONCE` at a time."""
-        ends = np.append(0, np.cumsum(self.points["length"].astype(np.int64)))
+        ends = offsets_of(self.points["length"])
         for first in range(0, len(self.points), AT_ONCE):
             last = min(first + AT_ONCE, len(self.points))
             yield self.points[first:last], self.tracks[ends[first] : ends[last]]
 
     def without_points(self, bare: BoolArray | None = None) -> Self:
         """Return the model without points; of `bare` (i,) images, without keypoints, too."""
-        counts = np.diff(self.starts)
+        counts = self.lengths()
         kept, counts = (
             (self.points2d.copy(), counts)
             if bare is None
@@ -173,7 +174,7 @@ class ModelArrays:
         kept["point3d_id"] = NO_POINT
         return replace(
             self,
-            starts=np.append(0, np.cumsum(counts)),
+            offsets=offsets_of(counts),
             points2d=kept,
             points=np.zeros(0, POINT3D),
             tracks=np.zeros((0, 2), np.uint32),
@@ -195,7 +196,7 @@ class ModelArrays:
         kept &= stays[owner]
         points, points2d = self.points[stays], self.points2d.copy()
         points["length"] = left[stays]
-        counts = np.diff(self.starts)
+        counts = self.lengths()
         gone = np.repeat(bare, counts) | np.isin(points2d["point3d_id"], self.points["id"][~stays])
         points2d["point3d_id"][gone] = NO_POINT
         return replace(

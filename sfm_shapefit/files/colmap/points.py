@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.files.colmap.lenses import camera_of, rays_of
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays
 from sfm_shapefit.scene.images import Images
@@ -66,7 +67,7 @@ def points_of(model: ModelArrays, images: Images) -> Points:
         xyz=np.ascontiguousarray(
             model.points["xyz"][np.searchsorted(model.points["id"], known.astype(np.uint64))]
         ),
-        offsets=np.append(0, np.cumsum(lengths)),
+        offsets=offsets_of(lengths),
         images=np.repeat(np.arange(len(seen)), [len(points) for _, points in seen])[order],
         keypoints=np.concatenate([keypoints for keypoints, _ in seen])[order],
         ids=known,

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.base.paths import refuse_irregular_file
 from sfm_shapefit.files.colmap import model_arrays
 from sfm_shapefit.files.colmap.binary_records import (
@@ -145,7 +146,7 @@ def read_files(files: ModelFiles) -> tuple[ModelArrays, tuple[str, ...]]:
     images = _read_images(files, set(cameras))
     heads = ImageRecords(images.ids, images.camera_ids, images.ids, images.names)
     model = ModelArrays.alone(lenses, heads, images.poses, frozenset())
-    model = replace(model, starts=images.starts, points2d=images.points2d)
+    model = replace(model, offsets=images.offsets, points2d=images.points2d)
     if files.has("rigs"):
         rigs = _read_rigs(files, set(cameras))
         frames, taken = _read_frames(files, rigs)
@@ -249,7 +250,7 @@ def _cameras_of(file: _BinaryFile, counts: dict[int, int]) -> tuple[tuple[Lens, 
         if model_id not in num_params:
             raise file.fault(f"camera {camera_id} has the unknown camera model {model_id}")
         if camera_id in lenses:
-            raise file.fault(f"camera {camera_id} stands twice")
+            raise file.fault(f"camera {camera_id} appears twice")
         count = counts.get(model_id, num_params[model_id][1])
         params = file.take(struct.Struct(f"<{count}d"), f"camera {camera_id}")
         if not all(map(math.isfinite, params)):
@@ -272,7 +273,7 @@ class _Images(NamedTuple):
     camera_ids: IntArray
     names: tuple[str, ...]
     poses: FloatArray
-    starts: IntArray
+    offsets: IntArray
     points2d: Records
 
 
@@ -295,7 +296,7 @@ def _read_images(files: ModelFiles, camera_ids: set[int]) -> _Images:
         if not name:
             raise file.fault(f"{label} has no name")
         if image_id in heads or name in names:
-            raise file.fault(f"{label} ({name.decode(errors='replace')}) stands twice")
+            raise file.fault(f"{label} ({name.decode(errors='replace')}) appears twice")
         count = file.take_count(POINT2D.itemsize, f"points of {label}")
         begin, end = end, end + count
         points2d[begin:end] = np.frombuffer(file.read(count * POINT2D.itemsize, label), dtype=POINT2D)
@@ -316,7 +317,7 @@ def _read_images(files: ModelFiles, camera_ids: set[int]) -> _Images:
         camera_ids=table[:, 7].astype(np.int64),
         names=tuple(called[i] for i in ids),
         poses=table[:, :7],
-        starts=np.append(0, np.cumsum(ends - begins)),
+        offsets=offsets_of(ends - begins),
         points2d=points2d,
     )
 
@@ -327,7 +328,7 @@ def _read_rigs(files: ModelFiles, camera_ids: set[int]) -> dict[int, RigRecord]:
         rig_id, num_sensors = map(int, file.take(RIG, "a rig"))
         label = f"rig {rig_id}"
         if rig_id in rigs:
-            raise file.fault(f"{label} stands twice")
+            raise file.fault(f"{label} appears twice")
         file.require_room(num_sensors, SENSOR_ID.size, f"sensors of {label}")
         sensors: dict[Sensor, FloatArray | None] = {}
         for k in range(num_sensors):
@@ -337,7 +338,7 @@ def _read_rigs(files: ModelFiles, camera_ids: set[int]) -> dict[int, RigRecord]:
                     f"{label} refers to camera {number}, which {files.beside('cameras')} does not have"
                 )
             if (kind, number) in sensors:
-                raise file.fault(f"{label} has a sensor that stands twice")
+                raise file.fault(f"{label} has a sensor that appears twice")
             has_pose = k > 0 and file.take(HAS_POSE, label)[0]
             pose = np.array(file.take(POSE, label)) if has_pose else None
             if pose is not None:
@@ -361,7 +362,7 @@ def _read_frames(files: ModelFiles, rigs: Mapping[int, RigRecord]) -> tuple[Fram
         number, rig, *pose, num_data = file.take(FRAME, "a frame")
         frame_id, rig_id, label = int(number), int(rig), f"frame {number}"
         if frame_id in heads:
-            raise file.fault(f"{label} stands twice")
+            raise file.fault(f"{label} appears twice")
         if rig_id not in rigs:
             raise file.fault(f"{label} refers to rig {rig_id}, which {files.beside('rigs')} does not have")
         file.refuse_pose(label, pose)
@@ -371,7 +372,7 @@ def _read_frames(files: ModelFiles, rigs: Mapping[int, RigRecord]) -> tuple[Fram
             if (kind, sensor_id) not in rigs[rig_id].sensors:
                 raise file.fault(f"{label} refers to sensor {sensor_id}, which rig {rig_id} does not have")
             if kind == CAMERA_SENSOR and image_id in taken:
-                raise file.fault(f"image {image_id} stands in two frames")
+                raise file.fault(f"image {image_id} is in two frames")
             if kind == CAMERA_SENSOR:
                 taken[image_id] = frame_id, sensor_id
         heads[frame_id] = (
@@ -427,12 +428,12 @@ def _with_points(files: ModelFiles, model: ModelArrays) -> ModelArrays:
             raise InputError(f"{called}: 3D point {point} has coordinates that are not finite")
         rows = np.searchsorted(model.images.ids, elements[:, 0])
         is_there = np.append(model.images.ids, -1)[rows] == elements[:, 0]
-        is_there &= elements[:, 1] < np.append(np.diff(model.starts), 0)[rows]
+        is_there &= elements[:, 1] < np.append(model.lengths(), 0)[rows]
         if not is_there.all():
             image_id, keypoint = elements[~is_there][0].tolist()
             reference = f"a track refers to point {keypoint} of image {image_id}"
             raise ContradictionError(f"{called}: {reference}, which {files.beside('images')} does not have")
-        other = _observe(model, heads, model.starts[rows] + elements[:, 1])
+        other = _observe(model, heads, model.offsets[rows] + elements[:, 1])
         if other and not contradiction:
             k, point, owner = other
             reference = (
@@ -458,7 +459,7 @@ def _take_points(file: _BinaryFile, model: ModelArrays) -> ModelArrays:
     file.finish()
     points, tracks = _ascending(heads.view(POINT3D).ravel(), elements.view("<u4").reshape(-1, 2))
     if len(repeated := points["id"][1:][points["id"][1:] == points["id"][:-1]]):
-        raise file.fault(f"3D point {repeated[0]} stands twice")
+        raise file.fault(f"3D point {repeated[0]} appears twice")
     return replace(model, points=points, tracks=tracks)
 
 
@@ -503,7 +504,7 @@ def _refuse_unknown_points(files: ModelFiles, model: ModelArrays) -> None:
         unknown = point_ids[np.searchsorted(point_ids, some)] != some
         if unknown.any():
             k = int(np.argmax(unknown))
-            image_id = model.images.ids[np.searchsorted(model.starts, begin + k, side="right") - 1]
+            image_id = model.images.ids[np.searchsorted(model.offsets, begin + k, side="right") - 1]
             raise ContradictionError(
                 f"{files.called_as('images')}: image {image_id} observes 3D point {some[k]}, which "
                 f"{files.beside('points3D')} does not have"

@@ -12,6 +12,7 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.files.colmap.binary_records import NO_POINT, POINT2D, POINT3D
 from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model_arrays import AT_ONCE, ModelArrays, Records
@@ -130,7 +131,7 @@ class SeededModel:
         heads, tracks = zip((np.zeros(0, POINT3D), np.zeros((0, 2), np.uint32)), *self._blocks(), strict=True)
         return replace(
             model,
-            starts=np.append(0, np.cumsum([len(one) for one in every])),
+            offsets=offsets_of([len(one) for one in every]),
             points2d=np.concatenate(every),
             points=np.concatenate(heads),
             tracks=np.concatenate(tracks),

@@ -7,6 +7,7 @@ keypoints gives no match for that point: it is unknown which one is right.
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
+from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import points_of
@@ -29,7 +30,7 @@ class TrackMatches(Matches):
         self.names = model.images.names
         self._model, rows = model.arrays, model.arrays.images.rows(model.images.ids)
         self._rows = dict(zip(self.names, rows.tolist(), strict=True))
-        self.num_keypoints = np.diff(model.arrays.starts)[rows]
+        self.num_keypoints = model.arrays.lengths()[rows]
         self.total_keypoints = int(self.num_keypoints.sum())
         seen = [model.arrays.observed(row) for row in rows.tolist()]
         points = np.concatenate([ids for _, ids in seen])
@@ -45,8 +46,7 @@ class TrackMatches(Matches):
         self._keypoints = np.concatenate([keypoints for keypoints, _ in seen])[order[once]].astype(np.uint32)
         _, sizes = np.unique(points[once], return_counts=True)
         self._following = np.repeat(np.cumsum(sizes), sizes) - np.arange(len(self._image_of)) - 1
-        self._by_image = np.argsort(self._image_of, kind="stable")
-        self._starts = np.append(0, np.cumsum(np.bincount(self._image_of, minlength=len(rows))))
+        self._of_images = RowLists.by_label(self._image_of, len(rows))
         self.pairs, self.num_matches = self._count()
 
     def at(self, images: Images, left_out: PairNames = frozenset(), reading: Reading = PLENTY) -> View:
@@ -95,8 +95,7 @@ class TrackMatches(Matches):
 
     def _pair_up(self, images: IntArray) -> tuple[IntArray, IntArray]:
         """Return the observations of the images, and with each in turn those of its point that follow."""
-        bounds = zip(self._starts[images].tolist(), self._starts[images + 1].tolist(), strict=True)
-        observations = np.concatenate([self._by_image[:0], *(self._by_image[a:b] for a, b in bounds)])
+        observations = self._of_images.subset(images).rows
         follows = self._following[observations]
         left = np.repeat(observations, follows)
         return left, left + 1 + np.arange(len(left)) - np.repeat(np.cumsum(follows) - follows, follows)

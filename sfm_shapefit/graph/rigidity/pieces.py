@@ -9,6 +9,7 @@ from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import compact
 from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.rigidity.game import contract, play
 from sfm_shapefit.graph.rigidity.growth import grow_sets, incidence, triangle_sets
@@ -116,7 +117,7 @@ def _find_pieces(num_nodes: int, pairs: IntArray, dimension: int) -> list[RigidP
     large_at = np.bincount(nodes[is_large], minlength=num_nodes)
     is_hinge = large_at[nodes] - is_large > 0
 
-    edges = np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1])
+    edges = RowLists.by_label(label)
     parts = zip(np.split(nodes, start[1:-1]), edges, np.split(is_hinge, start[1:-1]), strict=True)
     return [RigidPiece(frozen(own), frozen(rows), frozen(own[hinge])) for own, rows, hinge in parts]
 

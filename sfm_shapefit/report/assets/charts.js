@@ -276,8 +276,14 @@ const drawConvergence = () => {
   return svg;
 };
 
+const BETWEEN = 12;
+const widthOfColumn = () => {
+  const { columnCount } = getComputedStyle($("more"));
+  const columns = Number(columnCount) || 1;
+  return Math.max(Math.min(($("more").clientWidth - BETWEEN * (columns - 1)) / columns - 34, 760), 280);
+};
 const drawCharts = (onChoice) => {
-  WIDTH = Math.max(Math.min($("cameras").clientWidth, 760), 280);
+  WIDTH = widthOfColumn();
   const made = {
     trust: drawTrust, histogram: drawHistogram,
     tracks: () => drawBars("tracks", "Track lengths", "images that see a point"),
@@ -295,7 +301,6 @@ const drawCharts = (onChoice) => {
 // Their texts keep their size when the window changes its own.
 const watchWidth = (onChoice) => {
   new ResizeObserver(() => {
-    const wanted = Math.max(Math.min($("cameras").clientWidth, 760), 280);
-    if (Math.abs(wanted - WIDTH) > 20) drawCharts(onChoice);
-  }).observe($("cameras"));
+    if (Math.abs(widthOfColumn() - WIDTH) > 20) drawCharts(onChoice);
+  }).observe($("more"));
 };

@@ -21,6 +21,16 @@ const data = decode(JSON.parse($("data").textContent));
 const { cameras, pairs, points } = data;
 const numCameras = cameras.names.length;
 const numPairs = pairs.first.length;
+// Of pairs: how many matches fit and contradict, how many of either are drawn, and the row of the first of these.
+const matches = new Map();
+if (data.matches) {
+  let first = 0;
+  data.matches.pair.forEach((p, k) => {
+    const [counts, drawn] = [data.matches.counts, data.matches.drawn].map((all) => Array.from(all.subarray(2 * k, 2 * k + 2)));
+    matches.set(p, { counts, drawn, first });
+    first += drawn[0] + drawn[1];
+  });
+}
 
 // Text breaks at blanks, a name after its folders, and elsewhere only where a part is very long.
 const breakable = (text) => text.split(/(?<=[/ ])/).flatMap((part) => [element("span", part, part.length < 25 ? "whole" : ""), element("wbr")]);

@@ -3,7 +3,7 @@
 const drawHead = () => {
   const { banner } = data;
   $("title").textContent = data.title;
-  $("subtitle").textContent = data.subtitle;
+  $("subtitle").textContent = [data.subtitle, data.day].filter(Boolean).join(", ");
   $("banner").dataset.grade = banner.grade;
   $("h-cameras").textContent = `${capital(data.noun)}s`;
   $("h-matrix").textContent = `Which ${data.noun}s are paired`;
@@ -13,16 +13,9 @@ const drawHead = () => {
   if (banner.command) {
     $("next").hidden = false;
     $("next-text").textContent = banner.next;
-    $("command").textContent = commandHere(banner.command);
+    $("command").textContent = banner.command;
     $("copy").onclick = copyCommand;
   }
-};
-// The model lies beside this page: its folder stands where the command says {out}.
-const commandHere = (command) => {
-  const inside = location.protocol === "file:" ? decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "") : "OUT";
-  const quote = (path) => (/^[\w@%+=:,./-]+$/.test(path) ? path : `'${path.replaceAll("'", "'\\''")}'`);
-  const folders = { images: data.images, out: inside, out_dense: `${inside}_dense` };
-  return command.replaceAll(/\{(\w+)\}/g, (word, name) => (name in folders ? quote(folders[name]) : word));
 };
 const copyCommand = async () => {
   const text = $("command").textContent;
@@ -102,6 +95,8 @@ const drawControl = () => {
   $("control-card").hidden = !data.control.length;
   fill("control", plainTable(["Name", "Use", "Off by (units)", "Along the axes (units)", "Off by (px)", "Marks"], data.control));
   $("control-note").textContent = data.notes.control;
+  $("bars-card").hidden = !data.bars.length;
+  fill("bars", plainTable(["Name", "Use", "Known (units)", "In the model (units)", "Off by (units)", "(σ)", "Off by (px)", "Marks"], data.bars));
 };
 const drawLoops = () => {
   $("loops-card").hidden = !data.loops.length;
@@ -117,56 +112,138 @@ const definitions = (facts) => {
   for (const [label, value] of known(facts)) list.append(element("dt", label), element("dd", value));
   return list;
 };
-const picture = (k) => {
-  const image = element("img");
-  image.src = data.pictures[k];
-  image.alt = "";
-  image.className = "thumbnail";
-  return image;
+const dotOf = (verdict) => {
+  const dotted = element("span", "", "dot");
+  if (verdict === null) return dotted;
+  dotted.style.background = `var(${VARIABLES[verdict]})`;
+  dotted.title = VERDICTS[verdict];
+  return dotted;
 };
 const listItem = (verdict, text, note, action) => {
   const line = element("li");
-  const dotted = element("span", "", "dot");
-  if (verdict !== null) {
-    dotted.style.background = `var(${VARIABLES[verdict]})`;
-    dotted.title = VERDICTS[verdict];
-  }
-  line.append(dotted, button(text, "link", action), element("span", note, "number"));
+  line.append(dotOf(verdict), button(text, "link", action), element("span", note, "number"));
   return line;
 };
+const otherEnd = (p, k) => (pairs.first[p] === k ? pairs.second[p] : pairs.first[p]);
+const picturesOf = (ends) => (data.pictures ? ends.filter((end) => data.pictures[end]) : []);
+
+// Pictures next to one another, each 100 wide, and the matches of a pair between two of them.
+const GAP = 2;
+const drawPictures = async (svg, shown, p) => {
+  const images = await Promise.all(shown.map(async (k) => {
+    const image = new Image();
+    image.src = data.pictures[k];
+    await image.decode();
+    return image;
+  }));
+  const heights = images.map((image) => (100 * image.naturalHeight) / image.naturalWidth);
+  svg.setAttribute("viewBox", `0 0 ${200 + GAP} ${Math.max(...heights)}`);
+  images.forEach((image, side) => svg.append(shape("image", {
+    href: image.src, x: side * (100 + GAP), width: 100, height: heights[side],
+  })));
+  const found = shown.length === 2 && matches.get(p);
+  if (!found) return;
+  const turned = pairs.first[p] === shown[0] ? 0 : 2;
+  const place = (row, side) => {
+    const from = 4 * row + ((2 * side + turned) % 4);
+    const [x, y] = data.matches.places.subarray(from, from + 2);
+    return `${(side * (100 + GAP) + x / 655.35).toFixed(1)} ${((heights[side] * y) / 65535).toFixed(1)}`;
+  };
+  ["--agrees", "--contradicts"].forEach((variable, kind) => {
+    let path = "";
+    const begin = found.first + kind * found.drawn[0];
+    for (let row = begin; row < begin + found.drawn[kind]; row++) path += `M${place(row, 0)}L${place(row, 1)}`;
+    if (path) svg.append(shape("path", { d: path, class: "match", stroke: `var(${variable})` }));
+  });
+};
+const matchesSaid = (p) => {
+  if (!data.matches) return [];
+  if (!matches.has(p)) return ["The matches of this pair are not on the page."];
+  const { counts, drawn } = matches.get(p);
+  const all = counts[0] + counts[1];
+  const few = drawn[0] + drawn[1] < all ? `${drawn[0] + drawn[1]} of ${counted(all, "match").replace("chs", "ches")} drawn: ` : "";
+  return [few, dotOf(0), ` ${count(counts[0])} fit, `, dotOf(1), ` ${count(counts[1])} contradict`];
+};
+const sideBySide = (k, p) => {
+  const shown = picturesOf([k, otherEnd(p, k)]);
+  const figure = element("figure", "", "beside");
+  if (!shown.length) return figure;
+  const svg = shape("svg", { viewBox: `0 0 ${200 + GAP} 75`, role: "img", "aria-label": `Pictures of ${pairTitle(p)}` });
+  drawPictures(svg, shown, p);
+  const caption = element("figcaption");
+  const [other, error] = [otherEnd(p, k), off(pairs.residual[p])];
+  const said = [`: ${VERDICTS[pairs.verdict[p]]}`, error && `off by ${error}`, reason(pairs.reason[p])].filter(Boolean).join(", ");
+  caption.append("Beside ", button(cameras.names[other], "link", () => select("camera", other)), `${said}. `, ...matchesSaid(p));
+  figure.append(svg, caption);
+  return figure;
+};
+// The pair whose matches tell most of a camera: most of them contradict, or, failing that, they are most.
+const mostTelling = (own) => {
+  const weight = (p) => {
+    const [fit, against] = matches.get(p)?.counts ?? [-1, -1];
+    return against > fit ? 1e9 + against : fit;
+  };
+  return own.reduce((best, p) => (weight(p) > weight(best) ? p : best), own[0]);
+};
+
 const cameraDetails = (k) => {
   const own = [];
   for (let p = 0; p < numPairs; p++) if (pairs.first[p] === k || pairs.second[p] === k) own.push(p);
   const others = element("ul");
-  for (const p of own.slice(0, MOST_LISTED)) {
-    const other = pairs.first[p] === k ? pairs.second[p] : pairs.first[p];
-    others.append(listItem(pairs.verdict[p], cameras.names[other], off(pairs.residual[p]), () => select("pair", p)));
-  }
   const title = own.length > MOST_LISTED ? `Its pairs, the worst ${MOST_LISTED} of ${count(own.length)}` : `Its pairs (${own.length})`;
   const right = element("div");
   right.append(element("h4", title), others);
-  return [cameras.names[k], cameraFacts(k), cameraExpertFacts(k), right, [k]];
+  const listed = own.slice(0, MOST_LISTED);
+  const seen = data.pictures ? listed.filter((p) => picturesOf([k, otherEnd(p, k)]).length === 2) : [];
+  let figure = element("figure", "", "beside");
+  const lay = (p) => {
+    const made = sideBySide(k, p);
+    figure.replaceWith(made);
+    figure = made;
+    [...others.children].forEach((item, row) => item.setAttribute("aria-current", String(listed[row] === p)));
+  };
+  for (const p of listed) {
+    const choose = seen.includes(p) ? () => lay(p) : () => select("pair", p);
+    others.append(listItem(pairs.verdict[p], cameras.names[otherEnd(p, k)], off(pairs.residual[p]), choose));
+  }
+  others.onkeydown = (event) => {
+    const to = { ArrowDown: "nextElementSibling", ArrowUp: "previousElementSibling" }[event.key];
+    const next = to && event.target.closest("li")?.[to]?.querySelector("button");
+    if (!next) return;
+    event.preventDefault();
+    next.focus();
+    if (seen.length) next.click();
+  };
+  const lead = () => (seen.length ? lay(mostTelling(seen)) : figure.replaceWith(...picturesOf([k]).map(picture)));
+  return [cameras.names[k], cameraFacts(k), cameraExpertFacts(k), right, [figure, lead]];
+};
+const picture = (k) => {
+  const image = element("img", "", "thumbnail");
+  [image.src, image.alt] = [data.pictures[k], ""];
+  return image;
 };
 const pairDetails = (p) => {
   const ends = [pairs.first[p], pairs.second[p]];
   const others = element("ul");
   for (const end of ends) others.append(listItem(null, cameras.names[end], "", () => select("camera", end)));
-  return ["Pair", pairFacts(p), pairExpertFacts(p), others, ends];
+  const figure = sideBySide(ends[0], p);
+  return ["Pair", pairFacts(p), pairExpertFacts(p), others, [figure, () => {}]];
 };
 const drawDetails = () => {
   $("details").classList.toggle("empty", !selected);
   $("stage").classList.toggle("chosen", Boolean(selected));
+  $("stage").classList.toggle("pictured", Boolean(data.pictures));
   if (!selected) {
     fill("details", element("p", "Click a camera or a pair: in the scene, in a table or in a chart. Drag turns the scene, " + (matchMedia("(pointer: coarse)").matches ? "two fingers zoom and shift." : "the wheel zooms, the right button shifts."), "muted"));
     return;
   }
   const [kind, k] = selected;
-  const [title, facts, expert, right, shown] = kind === "camera" ? cameraDetails(k) : pairDetails(k);
+  const [title, facts, expert, right, [figure, lead]] = kind === "camera" ? cameraDetails(k) : pairDetails(k);
   const left = element("div");
-  left.append(element("h3", title));
-  if (data.pictures) left.append(...shown.filter((end) => data.pictures[end]).map(picture));
   left.append(definitions(facts), folded("For experts", definitions(expert)));
-  fill("details", left, right);
+  fill("details", element("h3", title), figure, left, right);
+  lead();
+  $("details").scrollTop = 0;
 };
 
 let scene = null;

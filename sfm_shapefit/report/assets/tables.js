@@ -3,6 +3,7 @@
 const ROWS_PER_PAGE = 10;
 
 const makeTable = (id, kind, total, columns, text, why, onChoice) => {
+  const isRanked = kind === "pair" || isKnown(cameras.trust) || cameras.reason.some((code) => code > 0);
   let order = Array.from({ length: total }, (_, k) => k);
   let page = 0;
   let sorted = null;
@@ -20,7 +21,7 @@ const makeTable = (id, kind, total, columns, text, why, onChoice) => {
   const head = table.createTHead().insertRow();
   const body = table.createTBody();
   const headings = columns.map((column) => {
-    const cell = element("th", "", column.number ? "number" : "");
+    const cell = element("th", "", `${column.number ? "number" : ""} ${column.minor ? "minor" : ""}`.trim());
     const sorter = button(column.title, "", () => sortBy(column));
     if (column.hint) sorter.title = column.hint;
     cell.scope = "col";
@@ -58,6 +59,7 @@ const makeTable = (id, kind, total, columns, text, why, onChoice) => {
     const last = Math.min(first + ROWS_PER_PAGE, order.length);
     body.replaceChildren(...order.slice(first, last).flatMap(rowOf));
     shown.textContent = order.length ? `${count(first + 1)}–${count(last)} of ${count(order.length)}` : "none";
+    if (order.length && !sorted && isRanked) shown.append(element("span", ", worst first", "minor"));
     back.disabled = page === 0;
     next.disabled = last >= order.length;
   };
@@ -110,34 +112,41 @@ const makeTable = (id, kind, total, columns, text, why, onChoice) => {
   };
 };
 
-const numeric = (title, value, digits, hint) => ({
-  title, hint, number: true, value, cell: (k) => element("td", number(value(k), digits), "number"),
+const numeric = (title, value, digits, hint, minor = false) => ({
+  title, hint, number: true, minor, value, cell: (k) => element("td", number(value(k), digits), minor ? "number minor" : "number"),
 });
+// Numbers of one kind, all with as many decimals as small ones of them need.
+const aligned = (title, values, digits, hint) => {
+  const decimals = digits - 1 - Math.floor(Math.log10(quantile(Array.from(values).filter((value) => value > 0), 0.1)));
+  const text = (value) => (decimals >= 0 && decimals <= 6 && Number.isFinite(value) ? value.toFixed(decimals) : number(value, digits));
+  return { ...numeric(title, (k) => values[k], digits, hint), cell: (k) => element("td", text(values[k]), "number") };
+};
 const named = (title, name) => ({ title, value: name, cell: (k) => element("td", name(k), "name") });
 const verdictCell = (p) => {
   const cell = element("td", "", "verdict");
   const dotted = element("span", "", "dot");
   dotted.style.background = `var(${VARIABLES[pairs.verdict[p]]})`;
-  cell.append(dotted, ` ${VERDICTS[pairs.verdict[p]]}`);
+  dotted.title = VERDICTS[pairs.verdict[p]];
+  cell.append(dotted, element("span", ` ${dotted.title}`, "word"));
   return cell;
 };
 const drawTables = (onChoice) => {
   // Rows arrive worst first: the cameras by trust, the pairs by verdict and residual.
   const isSaid = new Set(data.looks.map(({ camera }) => camera));
   const why = (k) => (isSaid.has(k) ? "" : reason(cameras.reason[k]) || (isPlaced(k) ? "" : "left out"));
-  const shift = cameras.shift ? [numeric("Shift", (k) => cameras.shift[k], 2, "How far it is from where the input has it, in units")] : [];
+  const shift = cameras.shift ? [aligned("Shift", cameras.shift, 2, "How far it is from where the input has it, in units")] : [];
   return {
     camera: makeTable("cameras", "camera", numCameras, [
       named(capital(data.noun), (k) => cameras.names[k]),
       ...(isKnown(cameras.trust) ? [numeric("Trust", (k) => cameras.trust[k], 2, "1: its matches fit as well as usual; below 0.6 it is left out unless you say otherwise")] : []),
-      ...(isKnown(cameras.sigma) ? [numeric("± units", (k) => (isPlaced(k) ? cameras.sigma[k] : NaN), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units")] : []),
+      ...(isKnown(cameras.sigma) ? [aligned("± units", cameras.sigma.map((value, k) => (isPlaced(k) ? value : NaN)), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units")] : []),
       numeric("Pair error (°)", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees"),
       {
         title: "Pairs agree", number: true, value: (k) => (cameras.degree[k] ? cameras.agreeing[k] / cameras.degree[k] : NaN),
         cell: (k) => element("td", cameras.degree[k] ? `${cameras.agreeing[k]}/${cameras.degree[k]}` : "none", "number"),
       },
       ...shift,
-      ...cameras.further.map(({ title, hint, values }) => numeric(title, (k) => values[k], 3, hint)),
+      ...cameras.further.map(({ title, hint, values }, c) => numeric(title, (k) => values[k], 3, hint, c > 1)),
     ], (k) => cameras.names[k], why, onChoice),
     pair: makeTable("pairs", "pair", numPairs, [
       named(`${capital(data.noun)} 1`, (p) => cameras.names[pairs.first[p]]),

@@ -252,7 +252,7 @@ const makeScene = (onChoice) => {
     const ratio = pixelRatio();
     if (one.cloud) {
       const size = 0.003 * radius * sizes.point * eye.pixelsPerUnit() * view.distance * ratio;
-      const limits = { least: 1.8 * ratio * Math.min(sizes.point, 2), most: 6 * ratio * sizes.point };
+      const limits = { least: 1.8 * ratio * Math.min(sizes.point, 2), most: 4 * ratio * sizes.point };
       painter.paint(one.cloud, { ...common, size, ...limits }, SHARES[detail()]);
     }
     if (one.lines && (!detail() || placed.length < 300)) painter.paint(one.lines, { ...common, scale: sizes.frustum, width: 1.6 * ratio });

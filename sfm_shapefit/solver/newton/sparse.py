@@ -15,7 +15,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.factor import FactorPlan, allocate_factor, analyze
+from sfm_shapefit.laplacian.factor import Factor, FactorPlan, allocate_factor, analyze
 from sfm_shapefit.solver.newton import steps
 from sfm_shapefit.solver.newton.steps import Iterate, Linearization, NewtonProgress, Problem, Work
 from sfm_shapefit.solver.program import along, differences
@@ -32,7 +32,7 @@ def solve_newton_sparse(
     on_iteration: OnIteration | None = None,
     *,
     start: tuple[FloatArray, FloatArray] | None = None,
-    plan: FactorPlan | None = None,
+    factor: Factor | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with a sparse Cholesky factor in d x d blocks.
 
@@ -46,12 +46,17 @@ def solve_newton_sparse(
         on_iteration: called after every factorization and its steps.
         start: locations (n, d) with L(T) > 0 and a feasible dual (m, d), such as that of a `Certificate`; the
             steps then begin with the smoothing that their gap allows. The closer, the fewer factorizations.
-        plan: of the factorization of the graph's Laplacian, if there already.
+        factor: from `allocate_newton`; of one thread if None.
     """
+    reduction = Reduction(allocate_newton(graph) if factor is None else factor)
+    return solve_newton_reduced(graph, reduction, tol, max_iterations, on_iteration, start)
+
+
+def allocate_newton(graph: ViewGraph, plan: FactorPlan | None = None, *, threads: int = 1) -> Factor:
+    """Return memory for the factor of `solve_newton_sparse`; `plan` is the graph's, if there is one."""
     if plan is None:
         plan = analyze(graph.num_nodes, graph.edges, graph.elimination_tree())
-    reduction = Reduction(allocate_factor(plan, steps.working_dimension(graph)))
-    return solve_newton_reduced(graph, reduction, tol, max_iterations, on_iteration, start)
+    return allocate_factor(plan, steps.working_dimension(graph), threads=threads)
 
 
 def solve_newton_reduced(

@@ -16,7 +16,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.factor import LaplacianFactor
 from sfm_shapefit.solver.certificate import Certificate, certify_in_place
-from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
+from sfm_shapefit.solver.newton.sparse import allocate_newton, solve_newton_sparse
 from sfm_shapefit.solver.newton.steps import working_dimension
 from sfm_shapefit.solver.program import projected_length, scale_functional
 from sfm_shapefit.solver.solver_options import OnIteration, Watch
@@ -190,10 +190,11 @@ def _newton(
     if factor is None or plan is None or not fits or plan.flops * d**3 > _NEWTON_FLOPS:
         return replace(result, stop=HybridStop.TOO_LARGE)
     watch, count = Watch(on_iteration, done=result.iterations), 0
+    normal = allocate_newton(graph, plan, threads=resources.threads)
     for start in (result.locations, result.certificate.dual), None:
         if start is None and not _is_cheap(factor, d):
             break
-        t, y, steps = solve_newton_sparse(graph, tol, _NEWTON_STEPS, watch, start=start, plan=plan)
+        t, y, steps = solve_newton_sparse(graph, tol, _NEWTON_STEPS, watch, start=start, factor=normal)
         result, count = _better(graph, result, t, y, tol, resources), count + steps
         if watch.cancelled or result.certificate.gap <= tol:
             break

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfm_shapefit.solver.damping import DampingRange, take_damped_step
+from sfm_shapefit.base.damping import DampingRange, take_damped_step
 
 
 def test_damping_rises_until_a_step_helps_falls_after_it_and_starts_again_where_none_helps():
@@ -18,3 +18,7 @@ def test_damping_rises_until_a_step_helps_falls_after_it_and_starts_again_where_
     tried.clear()
     assert take_damped_step(tried.append, 1.0, DampingRange(first=1e-3, most=1e3)) == (None, 1e-3)
     assert tried == [1.0, 10.0, 100.0, 1000.0]
+    tried.clear()
+    rising = DampingRange(first=1e-3, most=1e3, growth=2.0, acceleration=2.0)
+    assert take_damped_step(tried.append, 1.0, rising) == (None, 1e-3)
+    assert tried == [1.0, 2.0, 8.0, 64.0]

@@ -1,0 +1,84 @@
+"""Lists of different lengths, whose rows stand in one table, one list after the other."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm_shapefit.base.arrays import AnyArray, IntArray
+
+
+def offsets_of(lengths: npt.ArrayLike) -> IntArray:
+    """Return where lists of some lengths (k,) begin in their table, and the end of the last, (k + 1,)."""
+    return np.append(0, np.cumsum(lengths, dtype=np.int64))
+
+
+class Lists:
+    """Lists of rows of a table, one after the other: list k has the rows offsets[k]:offsets[k + 1]."""
+
+    __slots__ = ()
+    offsets: IntArray
+    """(k + 1,)"""
+
+    def lengths(self) -> IntArray:
+        """Return the number of rows of each list, (k,)."""
+        return np.diff(self.offsets)
+
+    def list_of_rows(self) -> IntArray:
+        """Return the list that each row stands in."""
+        return self.spread(np.arange(len(self.offsets) - 1))
+
+    def spread(self, values: AnyArray) -> AnyArray:
+        """Return the value of each row's list, of values (k, ...) of the lists."""
+        return np.repeat(values, self.lengths(), axis=0)  # type: ignore[return-value]
+
+    def ranks(self) -> IntArray:
+        """Return which row of its list each row is, from 0 on."""
+        return np.arange(self.offsets[-1]) - self.spread(self.offsets[:-1])
+
+    def slice_of(self, k: int) -> slice:
+        """Return the rows of a list."""
+        return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
+
+    def slices(self) -> list[slice]:
+        """Return the rows of each list."""
+        return [self.slice_of(k) for k in range(len(self.offsets) - 1)]
+
+    def rows_of(self, chosen: IntArray) -> "RowLists":
+        """Return the rows of some lists, in that order."""
+        lengths = self.lengths()[chosen]
+        offsets = offsets_of(lengths)
+        rows = np.repeat(self.offsets[chosen] - offsets[:-1], lengths) + np.arange(offsets[-1])
+        return RowLists(offsets, rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RowLists(Lists):
+    """Lists of rows of other arrays; the rows of list k are rows[offsets[k]:offsets[k + 1]]."""
+
+    offsets: IntArray
+    """(k + 1,)"""
+    rows: IntArray
+    """(m,)"""
+
+    @classmethod
+    def by_label(cls, labels: IntArray, count: int = 0) -> "RowLists":
+        """Return a list for each of `count` labels or more, of the rows (m,) that have it, ascending.
+
+        Rows whose label is negative are in none.
+        """
+        rows = np.argsort(labels, kind="stable")[np.sum(labels < 0) :]
+        return cls(offsets_of(np.bincount(labels[rows], minlength=count)), rows)
+
+    def __iter__(self) -> Iterator[IntArray]:
+        """Return the rows of each list in turn."""
+        return (self.rows[own] for own in self.slices())
+
+    def subset(self, chosen: IntArray) -> "RowLists":
+        """Return some of the lists, in that order."""
+        return self.of(self.rows_of(chosen))
+
+    def of(self, lists: "RowLists") -> "RowLists":
+        """Return lists of rows of this one's rows as lists of rows of the other arrays."""
+        return RowLists(lists.offsets, self.rows[lists.rows])
