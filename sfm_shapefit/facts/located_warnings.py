@@ -32,10 +32,6 @@ def located_warnings(result: LocateResult, of_scale: Sequence[str]) -> Iterator[
         yield f"{NO_POINTS}; bundle adjustment has nothing to start from"
     yield from prior_warnings(result.prior_fit, images.names)
     yield from of_scale
-<<<<<<< HEAD
-    unsupported = [images.names[k] for k in np.flatnonzero(result.support.unsupported).tolist()]
-    yield from support_warnings(unsupported, is_kept=options.trust.min_trust == 0.0)
-=======
     if options.trust.min_trust == 0.0:
-        yield from support_warnings([images.names[k] for k in np.flatnonzero(result.unsupported).tolist()])
->>>>>>> integ
+        unsupported = np.flatnonzero(result.support.unsupported).tolist()
+        yield from support_warnings([images.names[k] for k in unsupported])

@@ -53,13 +53,8 @@ def second_configuration(found):
 
 
 def unsupported(found):
-<<<<<<< HEAD
     told = replace(found, support=found.support._replace(unsupported=np.arange(8) == 3))
-    return told, support_warnings([found.images.names[3]], is_kept=True)
-=======
-    told = replace(found, unsupported=np.arange(8) == 3)
     return told, support_warnings([found.images.names[3]])
->>>>>>> integ
 
 
 def twofold(found, status=DirectionStatus.TWO_MOTIONS):
