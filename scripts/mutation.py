@@ -54,6 +54,20 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "program": (("solver/program.py", "solver/solver_options.py"), ("solver", "newton")),
     "solve": (("solver/solve.py",), ("solver", "certificate", "splitting", "rigid_groups")),
     "angular": (("refinement/angular.py",), ("angular",)),
+    "stages": (
+        tuple(f"pipeline/{name}.py" for name in ("stages", "state", "remedies", "seed")),
+        ("stages", "remedies"),
+    ),
+    "factors": (
+        tuple(f"laplacian/{name}.py" for name in ("factor", "blocks", "operators", "superlu")),
+        ("laplacian", "selected_inverse", "iterative"),
+    ),
+    "judgement": (
+        tuple(
+            f"judgement/{name}.py" for name in ("seams", "ties", "places", "second_opinion", "wrong_lenses")
+        ),
+        ("seams", "ties", "places", "second_opinion", "left_out", "warnings_and_grades", "verdicts"),
+    ),
     "reduction": (("solver/reduction.py", "solver/tied.py"), ("rigid_groups",)),
 }
 """Files of the package, and the names of the tests that are to notice their mutants."""
