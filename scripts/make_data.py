@@ -23,6 +23,7 @@ from sfm_shapefit.synthetic import (
     make_scene,
     random_graph_problem,
 )
+from sfm_shapefit.synthetic.layouts import SceneCameras
 from sfm_shapefit.synthetic.models import image_name
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
@@ -139,15 +140,31 @@ def control_points_text() -> str:
     lines = ["local\n"]
     for k, (x, y, z) in enumerate(measured.tolist()):
         name = f"P{k + 1}" if k < 7 else f"CHK-{k - 6}"
-        marks = [
-            (image_name(image), *pixels[points == chosen[k]][0])
-            for image, (pixels, points) in enumerate(zip(scene.keypoints, scene.keypoint_points, strict=True))
-            if (points == chosen[k]).any()
-        ]
-        lines += [
-            f"{x:.3f} {y:.3f} {z:.3f} {u:.1f} {v:.1f} {image} {name}\n"
-            for image, u, v in marks[:: len(marks) // 5]
-        ]
+        lines += [f"{x:.3f} {y:.3f} {z:.3f} {mark} {name}\n" for mark in marks_of(scene, chosen[k])]
+    return "".join(lines)
+
+
+def marks_of(scene: SceneCameras, point: int) -> list[str]:
+    """Return pixels and image of about five of the keypoints that see a point."""
+    seen = zip(scene.keypoints, scene.keypoint_points, strict=True)
+    marks = [
+        f"{pixels[points == point][0, 0]:.1f} {pixels[points == point][0, 1]:.1f} {image_name(image)}"
+        for image, (pixels, points) in enumerate(seen)
+        if (points == point).any()
+    ]
+    return marks[:: len(marks) // 5]
+
+
+def scale_bars_text() -> str:
+    """Return four scale bars of the courtyard, known to 2 mm, one of them to check."""
+    scene = make_scene(SCENES["courtyard"].scene)
+    seen = np.bincount(np.concatenate([own[own >= 0] for own in scene.keypoint_points]))
+    chosen, rng = np.argsort(-seen, kind="stable")[:80:10].reshape(4, 2), np.random.default_rng(0)
+    lines = ["# length, its standard deviation, pixels, image, name of the bar, and which end it is\n"]
+    for name, ends in zip(("B1", "B2", "B3", "CHK-1"), chosen.tolist(), strict=True):
+        length = np.linalg.norm(scene.points[ends[0]] - scene.points[ends[1]]) + 0.002 * rng.standard_normal()
+        for end, point in zip(("left", "right"), ends, strict=True):
+            lines += [f"{length:.4f} 0.002 {mark} {name} {end}\n" for mark in marks_of(scene, point)]
     return "".join(lines)
 
 
@@ -174,6 +191,7 @@ TABLES = {
     "graph40.txt": bundled_graph_text,
     "gps.csv": measured_positions_text,
     "gcp_list.txt": control_points_text,
+    "scale_bars.txt": scale_bars_text,
     "gravity.txt": gravity_text,
     "names.txt": names_text,
     "across.txt": across_text,

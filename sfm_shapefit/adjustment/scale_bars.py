@@ -31,6 +31,8 @@ class BarFit(NamedTuple):
     """Relative standard deviation of the scale."""
     used: BoolArray
     """(b,) bars that set it."""
+    num_control: int
+    """Bars that the model has and that may set it."""
     scores: FloatArray
     """(b,) by how much each is longer in the model than the others make it, in standard deviations of that;
     NaN for bars that the model lacks, and where there is no other."""
@@ -40,8 +42,8 @@ class BarFit(NamedTuple):
     @property
     def statement(self) -> str:
         """How well the bars agree, a clause."""
-        count, of = int(self.used.sum()), int(np.sum(self.used | (np.abs(self.scores) > _MOST_SIGMAS)))
-        return f"{count} of {of} agree, the scale is known to {100.0 * self.sigma:.2g} %"
+        known = f"the scale is known to {100.0 * self.sigma:.2g} %"
+        return f"{int(self.used.sum())} of {self.num_control} agree, {known}"
 
     @property
     def contradict(self) -> bool:
@@ -80,6 +82,7 @@ def fit_scale_bars(bars: ScaleBars, found: Distances) -> BarFit | None:
         scale=float(np.exp(weights[used] @ y[used])),
         sigma=float(sigma),
         used=used,
+        num_control=int(np.sum(known & ~bars.is_check)),
         scores=scores,
         errors=ScaleErrors(draws, float(np.sqrt(max(sigma**2 - np.sum(draws**2), 0.0)))),
     )

@@ -128,7 +128,7 @@ def _tell_lengths(source: Path, lengths: list[str], bars: Path | None, *, as_jso
         if as_json:
             print_json(found.summary())
         else:
-            print_table(str(source), found.facts.told(), "see --json")
+            print_table(str(source), found.told(), "see --json")
 
 
 def _told(errors: "Evaluation | PositionEvaluation", *, verbose: bool) -> list[Row]:

@@ -1,14 +1,13 @@
 """How well a length in a model is known, in the user's unit: for the whole model, and between two places."""
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.place_errors import Distances, PlaceErrors, ScaleErrors
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.display import Displayed, Row, row
+from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import rounded
 from sfm_shapefit.facts.scale_bars import ScaleBar
@@ -109,17 +108,6 @@ class LengthsFacts(Record):
             Row("scale bars", [one.line for one in self.scale_bars]),
             Row("warning", self.warnings),
         ]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class LengthEvaluation(Displayed):
-    """How well lengths of a model are known, and how scale bars compare."""
-
-    facts: LengthsFacts
-    """The figures, as they stand in JSON."""
-
-    def _headline(self) -> str:
-        return self.facts.usual.statement if self.facts.usual else "how well lengths are known is not known"
 
 
 def name_direction(direction: FloatArray, *, has_up: bool) -> str:

@@ -89,7 +89,7 @@ class MeasuredBars(NamedTuple):
         own = known.points // 2 == k
         sets = self.fit is not None and bool(self.fit.used[k])
         compared = self.fit is not None and not known.is_check[k]
-        found, errors = float(self.found.lengths[k]), marks.errors_px[own & marks.agreeing]
+        found, errors = float(self.found.lengths[k]) or np.nan, marks.errors_px[own & marks.agreeing]
         unused = not np.isfinite(found) or (compared and not sets)
         return ScaleBar(
             name=known.bars[k],
@@ -114,7 +114,7 @@ class MeasuredBars(NamedTuple):
             first = lost[0].name
             yield (
                 f"{place_of[first]}: {first}{_more(lost)} of no use: an end lacks agreeing marks in two "
-                "placed images that see it from far enough apart; mark it in others"
+                "placed images that see it from far enough apart, or both are one point; mark it in others"
             )
         off = [row for row in rows if row.found is not None and abs(row.error_sigmas or 0.0) > _WRONG]
         off = [row for row in off if self.fit is None or row.use != "control" or self.fit.contradict]

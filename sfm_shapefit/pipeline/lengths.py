@@ -16,13 +16,12 @@ from sfm_shapefit.adjustment.place_errors import (
     errors_of_points,
 )
 from sfm_shapefit.adjustment.run import begin
-from sfm_shapefit.adjustment.scale_bars import BarFit, fit_scale_bars, pooled_noise
+from sfm_shapefit.adjustment.scale_bars import pooled_noise
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.lengths import (
     Axes,
     LengthBetween,
-    LengthEvaluation,
     LengthFacts,
     LengthsFacts,
     spread_rows,
@@ -71,11 +70,6 @@ def compare_bars(
     found = measure_bars(images, known, estimate, StructureOptions())
     count = found.found.draws.shape[2]
     return found._replace(found=found.found.in_scale(ScaleErrors(np.zeros(count), scale_sigma or 0.0)))
-
-
-def fit_bars(images: Images, known: ScaleBars) -> BarFit | None:
-    """Return the scale that bars give a model of whose errors nothing is known; None if they give none."""
-    return fit_scale_bars(known, measure_bars(images, known, None, StructureOptions()).found)
 
 
 def usual_length(state: ModelState) -> LengthFacts | None:
@@ -137,12 +131,12 @@ def evaluate_lengths(
     ends: Sequence[tuple[str | int, str | int]] = (),
     *,
     scale_bars: Path | str | None = None,
-) -> LengthEvaluation:
+) -> LengthsFacts:
     """Return how well lengths in a model are known, and how it compares with known ones.
 
         found = evaluate_lengths("sparse/0", [("0001.jpg", "0004.jpg"), (17, 402)], scale_bars="bars.txt")
-        print(found.facts.usual.statement)
-        print(found.facts.lengths[0].length.interval)      # 2.503 ± 0.004 (95 %), worst direction ...
+        print(found.usual.statement)
+        print(found.lengths[0].length.interval)            # 2.503 ± 0.004 (95 %), worst direction ...
 
     The errors are those that the pixels show where the model stands: noise, rotations, calibration. That of
     the scale is included where the model knows it, as one of `locate` does.
@@ -165,14 +159,12 @@ def evaluate_lengths(
     datum = model_datum(model)
     axes = Axes(unit="m" if datum else "units", has_scale=scale_sigma is not None, has_up=datum is not None)
     scale = ScaleErrors(np.zeros(_num_draws(estimate)), scale_sigma or 0.0)
-    return LengthEvaluation(
-        facts=LengthsFacts(
-            usual=length_between(images, points, estimate, scale, axes),
-            lengths=list(_between(seen, scale, axes, ends)),
-            scale_bars=bars.rows() if bars else (),
-            scale_sigma=scale_sigma,
-            warnings=[*posed.notes, *(bars.warnings() if bars else ())],
-        )
+    return LengthsFacts(
+        usual=length_between(images, points, estimate, scale, axes),
+        lengths=list(_between(seen, scale, axes, ends)),
+        scale_bars=bars.rows() if bars else (),
+        scale_sigma=scale_sigma,
+        warnings=[*posed.notes, *(bars.warnings() if bars else ())],
     )
 
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.scale_bars import fit_scale_bars
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
@@ -30,7 +31,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.lengths import compare_bars, fit_bars
+from sfm_shapefit.pipeline.lengths import compare_bars
 from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.placement.gauge import Gauge
@@ -92,7 +93,7 @@ def _at_known_scale(pieces: Sequence[ModelPiece], join: PieceJoin) -> PieceJoin:
     if not all(one.model.images.has_rigs for one in two):
         return replace(join, reason="only one of them has rigs of several cameras, and a scale by that")
     if not all(one.is_metric for one in two):
-        return replace(join, reason="their rigs do not tell the scale of both")
+        return replace(join, reason="their rigs do not give the scale of both")
     sigma = float(np.linalg.norm([one.scale_sigma or 0.0 for one in two]))
     # Errors of the size of the second model move its cameras about their middle.
     center_sigma = float(np.hypot(join.center_sigma, sigma * median_spread(two[1].model.images.centers)))
@@ -258,11 +259,12 @@ def _choose_scale(group: JoinedGroup, first: Gauge, join_inputs: JoinInputs) -> 
     images, warning = read_model(group.reconstruction).images, ""
     distances = [one for one in join_inputs.distances if {*one[:2]} <= {*images.names}]
     if first.scale in _ARBITRARY:
-        fit = join_inputs.bars and fit_bars(images, join_inputs.bars)
-        if join_inputs.bars and fit:
+        known = join_inputs.bars
+        fit = known and fit_scale_bars(known, compare_bars(images, known, None, None).found)
+        if known and fit:
             middle, said = (
                 images.centers.mean(axis=0),
-                f"scale bars: {join_inputs.bars.statement}; {fit.statement}",
+                f"scale bars: {known.statement}; {fit.statement}",
             )
             motion, gauge = resized_gauge(first, middle, fit.scale, fit.sigma, said)
             return gauge, _moved(group, motion)
