@@ -1,9 +1,11 @@
-"""Build a wheel that carries compiled kernels: `python scripts/kernel_wheel.py dist`.
+"""Build a wheel that carries compiled kernels, `python scripts/kernel_wheel.py dist`, or take its kernels.
 
 The wheel that hatchling makes is unpacked, `warm-up` compiles from its sources, where this checkout has not
 compiled all, and what it kept becomes the package's folder `_kernels`, see `base/kernel_cache`. Machine
 code and its wrapping depend on the minor versions of Python and numba, so the wheel requires those, and runs
 where numba's own wheel does.
+
+With `--take` a checkout gets what wheels have compiled of its own sources, which `scripts/setup` asks for.
 """
 
 import argparse
@@ -15,19 +17,42 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from contextlib import suppress
 from importlib.metadata import distribution
 from pathlib import Path
 
-from sfm_shapefit.base.kernel_cache import RUNTIME, stamp_of
+from sfm_shapefit.base.kernel_cache import PACKAGE, RUNTIME, stamp_of, write_whole
 from sfm_shapefit.pipeline.warm_up import FURTHER, NEEDED
 
 ROOT = Path(__file__).parents[1]
+_NOTES = Path("pipeline")
+"""Where warm-up notes the examples that are done; it has no kernels."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, nargs="?", default=ROOT / "dist", help="folder of the wheel (dist)")
-    print(build(parser.parse_args().out))
+    parser.add_argument("--take", action="store_true", help="take the kernels of the wheels in the folder")
+    args = parser.parse_args()
+    if not args.take:
+        print(build(args.out))
+    for wheel in sorted(args.out.glob("sfm_shapefit-*.whl")) if args.take else ():
+        print(f"{wheel}: took {take(wheel, PACKAGE)} kernels")
+
+
+def take(wheel: Path, package: Path) -> int:
+    """Put the kernels of a wheel where a checkout keeps its own, if they are of its sources; return how many.
+
+    None are taken of what is no wheel.
+    """
+    taken = 0
+    with suppress(zipfile.BadZipFile), zipfile.ZipFile(wheel) as archive:
+        for name in archive.namelist():
+            place = Path(name.removeprefix("sfm_shapefit/_kernels/"))
+            if place.suffix == ".nbc" and _is_of_these_sources(place):
+                write_whole(package / place.parent / "__pycache__" / place.name, archive.read(name))
+                taken += 1
+    return taken
 
 
 def build(out: Path) -> Path:
@@ -66,15 +91,22 @@ def _copy_kernels(checkout: Path, package: Path) -> set[str]:
     """Copy what is compiled beside the sources of this checkout and not stale; return the examples done."""
     done = set()
     for file in checkout.rglob("__pycache__/*.nbc"):
-        folder = file.parent.parent
-        is_note = folder.name == "pipeline"
-        source = folder / ("examples.py" if is_note else f"{file.name.partition('.')[0]}.py")
-        if f"-{RUNTIME}-{stamp_of(source)}-" in file.name:
+        folder = file.parent.parent.relative_to(checkout)
+        if _is_of_these_sources(folder / file.name):
             place = package / file.relative_to(checkout)
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, place)
-            done |= {file.name.partition("-")[0]} if is_note else set()
+            done |= {file.name.partition("-")[0]} if folder == _NOTES else set()
     return done
+
+
+def _is_of_these_sources(file: Path) -> bool:
+    """Return whether a kernel, or the note that an example is done, holds for this checkout and this numba.
+
+    `file` is in the folder of its source, relative to the package.
+    """
+    source = "examples.py" if file.parent == _NOTES else f"{file.name.partition('.')[0]}.py"
+    return f"-{RUNTIME}-{stamp_of(PACKAGE / file.parent / source)}-" in file.name
 
 
 def _carry_kernels(package: Path, made_for: str) -> None:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.facts.result import LocateResult as LocateResult
     from sfm_shapefit.files.colmap.quiet import hear_pycolmap as hear_pycolmap
     from sfm_shapefit.files.matching_options import MatchingOptions as MatchingOptions
+    from sfm_shapefit.files.undistortion_options import UndistortionOptions as UndistortionOptions
     from sfm_shapefit.graph.viewgraph import ViewGraph as ViewGraph
     from sfm_shapefit.judgement.trust_options import TrustOptions as TrustOptions
     from sfm_shapefit.pairs.direction_options import DirectionOptions as DirectionOptions
@@ -83,6 +84,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "files.colmap.quiet": ("hear_pycolmap",),
     "files.matching_options": ("MatchingOptions",),
+    "files.undistortion_options": ("UndistortionOptions",),
     "adjustment.adjustment_options": ("AdjustmentOptions",),
     "pipeline.bundle_adjust": ("AdjustedModel", "bundle_adjust"),
     "pipeline.check": ("check", "check_pieces"),

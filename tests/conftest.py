@@ -18,6 +18,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.clusters import client_of
 from tests.scenes import COURTYARD, RING
 
 pytest_plugins = ["pytester", "sfm_shapefit.synthetic.fixtures"]
@@ -45,12 +46,8 @@ def drawn(tmp_path_factory) -> tuple[RenderedScene, Path]:
 
 @pytest.fixture(scope="session")
 def dask_client():
-    """A client of two workers, threads of this process; it stands in for a cluster."""
-    distributed = pytest.importorskip("distributed")
-    local = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address="127.0.0.1:0"
-    )
-    with local, distributed.Client(local, set_as_default=False) as client:
+    """A client of two workers, threads of this process."""
+    with client_of(2) as client:
         yield client
 
 

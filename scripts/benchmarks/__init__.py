@@ -20,6 +20,7 @@ INDEX = {
     "onedsfm": "The published 1DSfM scene Madrid Metropolis: seconds per stage, residuals of each objective.",
     "panoramas": "Native panoramas against a cubemap rig of one rendered yard, beside global mapping.",
     "peers": "pytheia, gtsam and pycolmap beside ours, on bare graphs and real scenes.",
+    "photographs": "From photographs to a verdict: map IMAGES OUT beside pycolmap called by hand.",
     "real": "Real scenes against their ground truth, as delivered and by the placement alone.",
     "rigs": "Metric scale and errors of a drive of two rigs, beside pycolmap's global mapping.",
     "rough": "Rough poses of other programs made exact, beside map from scratch; wrong ones named.",

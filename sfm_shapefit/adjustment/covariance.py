@@ -281,7 +281,7 @@ def _dual(motions: FloatArray, nodes: IntArray) -> FloatArray:
             gram = np.einsum("nai,naj->ij", dual, motions)
         read: FloatArray = dual @ np.linalg.inv(gram)
     except np.linalg.LinAlgError:
-        raise UnsolvableError("its cameras do not stand apart where the adjustment has them") from None
+        raise UnsolvableError("its cameras are not apart where the adjustment has them") from None
     return read
 
 

@@ -31,7 +31,7 @@ import numpy as np
 from sfm_shapefit.adjustment.gauge import small_similarities
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.schur import ReducedSystem
+from sfm_shapefit.adjustment.schur import UNDETERMINED, ReducedSystem
 from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct, rank_within, sum_by
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
@@ -40,9 +40,6 @@ from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.laplacian.blocks import cut_graph, grow_blocks
 from sfm_shapefit.laplacian.factor import Factor, allocate_factor, analyze
 from sfm_shapefit.laplacian.operators import Workers
-
-UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"
-"""What is said of a system that is singular."""
 
 # Nodes of a block, and the share of them by which it grows; the counts of iterations hardly depend on them.
 _BLOCK, _OVERLAP = 150, 0.15

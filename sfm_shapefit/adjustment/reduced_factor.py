@@ -18,10 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
-from sfm_shapefit.adjustment.iterative_factor import UNDETERMINED, IterativeFactor
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.schur import ReducedSystem
+from sfm_shapefit.adjustment.schur import UNDETERMINED, ReducedSystem
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
@@ -87,6 +86,8 @@ def choose_solver(
     if _is_dense(layout, options):
         return DenseFactor.plan(layout, options.threads)
     if options.linear_solver == "iterative" or (is_divided and options.linear_solver == "auto"):
+        from sfm_shapefit.adjustment.iterative_factor import IterativeFactor  # here: few ask for it
+
         return IterativeFactor(problem, layout, workers)
     return SparseFactor.of(layout, options.threads, np.float32)
 

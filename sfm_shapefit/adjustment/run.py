@@ -180,9 +180,12 @@ class AdjustmentRun:
         thin = tracks.of_points(found.points_seen)
         images = views_of(self.images).images[thin.cameras]
         chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, self.images.num_images, times)
-        seen = np.repeat(np.arange(len(chosen)), thin.lengths()[chosen])
-        points = TriangulatedPoints(points=found.points[chosen], tracks=chosen, points_seen=seen)
-        return self.problem(thin.subset(chosen), points)
+        del images
+        place = np.full(len(found.points), -1)
+        place[chosen] = np.arange(len(chosen))
+        points = found.points[chosen]
+        seen = thin.spread(place)  # rather than a copy of the tracks that are chosen, which is large
+        return self.problem(thin, TriangulatedPoints(points=points, tracks=chosen, points_seen=seen))
 
     def choose_scale(self, problem: AdjustmentProblem) -> float:
         """Return the scale of the loss that the errors of a problem call for, in pixel thresholds."""

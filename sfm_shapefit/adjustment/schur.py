@@ -24,6 +24,9 @@ _ENTRIES_WORTH_A_THREAD = 1_000  # entries; each meets all others of its point, 
 _ENTRIES_OF_POINTS_WORTH_A_THREAD = 50_000  # entries; each is only multiplied by a step
 _SINGULAR = 1e-12  # least pivot of a point's block, relative to its diagonal: a parallax of 1e-6 rad
 
+UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"
+"""What is said of a system that is singular."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ReducedSystem:

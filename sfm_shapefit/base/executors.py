@@ -1,8 +1,10 @@
 """Work shared out among threads, or among the workers of a cluster; answers come in order."""
 
+from asyncio import CancelledError
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Protocol, TypeVar
@@ -91,7 +93,8 @@ class Crew:
         """
         if self.cluster is None:
             return list(map(work, *given))
-        return [self.cluster.submit(work, *task) for task in zip(*given, strict=True)]
+        with _failures_told():
+            return [self.cluster.submit(work, *task) for task in zip(*given, strict=True)]
 
     def share(self, value: Answer) -> Any:
         """Return a value, or where it is kept, as an argument of many tasks; it is sent once."""
@@ -109,7 +112,8 @@ class Crew:
         sent: deque[Any] = deque()
         try:
             for task in zip(*given, strict=True):
-                sent.append(self.cluster.submit(work, *task))
+                with _failures_told():
+                    sent.append(self.cluster.submit(work, *task))
                 if len(sent) == _TASKS_AT_ONCE:
                     yield _answer(sent.popleft())
             while sent:
@@ -128,12 +132,19 @@ def _same(value: Answer) -> Answer:
 
 
 def _answer(future: Any) -> Any:
-    try:
+    with _failures_told():
         return future.result()
+
+
+@contextmanager
+def _failures_told() -> Iterator[None]:
+    """Raise what a cluster raises in one sentence; what the work itself says passes as it is."""
+    try:
+        yield
     except ShapeFitError:
         raise
-    except Exception as error:
+    except (Exception, CancelledError) as error:
         what = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise WorkerError(
-            f"a worker failed ({what}); look at its log and its memory, and run again"
+            f"the workers failed ({what}); look at their logs and memory, and at the scheduler, and run again"
         ) from error

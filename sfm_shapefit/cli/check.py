@@ -29,6 +29,7 @@ from sfm_shapefit.cli.flags import (
     ScaleBarsFile,
     one_path,
 )
+from sfm_shapefit.cli.forecast import PLANS
 from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
 
@@ -113,12 +114,13 @@ def check_command(
             if report.exists() and not overwrite and (images is None or known is not None):
                 read_source(source, database)  # what is wrong with that is said first
             refuse_file(report, overwrite=overwrite, protect=inputs)
+        plan = () if known is None or no_second_opinion else PLANS["MODEL with a database"]
         bars = None if scale_bars is None else judge_bars(source, scale_bars)
         with (
             claimed_output(second_opinion, overwrite=overwrite, protect=inputs)
             if second_opinion
             else nullcontext(),
-            show_progress(not (quiet or as_json)) as progress,
+            show_progress(not (quiet or as_json), plan=plan) as progress,
             hear_pycolmap(False),
         ):
             found = check(

@@ -39,7 +39,8 @@ PriorsFile = Annotated[
         "--priors",
         metavar="FILE|FOLDER|database",
         help="Position priors of a file (name x y z [sigma], a table with a header, COLMAP's JSON), of the "
-        "EXIF data of a folder of images, or of the database; standard deviations make them pull.",
+        "EXIF data of a folder of images, or of the database; those with standard deviations also hold the "
+        "cameras.",
     ),
 ]
 
@@ -85,6 +86,8 @@ _METAVARS: dict[Any, str] = {
     "rotations": "auto|held|free|SIGMA_DEG",
     "config": "FILE",
     "images": "FOLDER",
+    "mask_path": "FOLDER",
+    "rig_config_path": "FILE",
     int: "INTEGER",
     float: "NUMBER",
     int | None: "INTEGER",

@@ -22,6 +22,7 @@ from sfm_shapefit.cli.console import (
     report_errors,
 )
 from sfm_shapefit.cli.flags import OutputFlags, read_options
+from sfm_shapefit.cli.forecast import PLANS
 from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.facts.command_options import FIX_SOLVED
 from sfm_shapefit.files.matching_options import MADE_FIRST
@@ -64,6 +65,8 @@ class Run(Generic[S]):
 
         flags = self.flags
         how: dict[str, Any] = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
+        if self.progress is not None:
+            self.progress("write", 0, 1)
         found = deliver(found, out, WriteOptions(protect=tuple(self.protect), **how))
         self.is_unusable = flags.strict and not found.verdict.is_usable
         if self.flags.json:
@@ -184,13 +187,14 @@ def command_run(
         if target.exists() and not flags.overwrite:  # what is wrong with the input is said first
             _refuse_unreadable(order, inputs, has_images=begun is not None)
         kept = () if begun is None else MADE_FIRST
+        plan = PLANS.get(order if begun is None else "IMAGES OUT", ())
         with claimed_output(target, overwrite=flags.overwrite, protect=run.protect, kept=kept):
             from sfm_shapefit.base.kernel_cache import measure_compilation
             from sfm_shapefit.files.colmap.quiet import hear_pycolmap
 
             with (
                 measure_compilation() as run.compiling,
-                show_progress(not flags.quiet, flags.verbose) as run.progress,
+                show_progress(not flags.quiet, flags.verbose, plan=plan) as run.progress,
                 hear_pycolmap(flags.verbose),
             ):
                 yield run

@@ -4,7 +4,6 @@ import atexit
 import gc
 import sys
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -51,8 +50,11 @@ class _PlainConversion:
         kind, limits = param.type_descriptor.annotation, param.type_descriptor.parameter_info
         is_limited = limits.min is not None or limits.max is not None
         if not (is_list or is_limited) and kind in _PLAIN and type(value) is str:
-            with suppress(ValueError):
+            try:
                 return _PLAIN[kind](value)
+            except ValueError:
+                whole = "a whole number" if kind in (int, int | None) else "a number"
+                raise typer.BadParameter(f"must be {whole}, got {value!r}", ctx, param) from None
         return type(param).get_runtime_param(param).coerce(value, param=param, ctx=ctx)
 
 

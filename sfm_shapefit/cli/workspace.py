@@ -1,7 +1,7 @@
 """`sfm-shapefit workspace MODEL IMAGES OUT`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,10 +13,15 @@ from sfm_shapefit.cli.flags import (
     OutArgument,
     OutputPath,
     Quiet,
+    flags_of,
     one_path,
+    read_options,
+    takes,
 )
+from sfm_shapefit.cli.forecast import PLANS
 from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
+from sfm_shapefit.files.undistortion_options import UndistortionOptions
 
 
 @app.command(
@@ -25,6 +30,7 @@ from sfm_shapefit.cli.root import app
     short_help="Write images and model without distortion, for splatting and dense programs.",
     epilog="Example: sfm-shapefit workspace mapped/0 images dense",
 )
+@takes(flags_of(UndistortionOptions), settings=UndistortionOptions)
 def workspace_command(
     model: ModelArgument = None,
     images: Annotated[
@@ -35,16 +41,8 @@ def workspace_command(
     input_path: InputPath = None,
     image_path: Annotated[Path | None, typer.Option("--image_path", hidden=True)] = None,
     output_path: OutputPath = None,
-    level: Annotated[
-        str,
-        typer.Option(
-            "--level",
-            metavar="auto|never",
-            help="Whether the world is turned so that z points up, by horizontal axes of images and the "
-            "plane of the ground: auto, unless priors or gravity did; never.",
-        ),
-    ] = "auto",
     quiet: Quiet = False,
+    **given: Any,
 ) -> None:
     """Write images and MODEL without distortion to OUT, as splatting and dense programs read them.
 
@@ -55,11 +53,10 @@ def workspace_command(
     folder = one_path(images, image_path, "IMAGES")
     target = one_path(out, output_path, "OUT")
     with report_errors(target):
-        from sfm_shapefit.pipeline.workspace import LEVELS, workspace
+        options = read_options(UndistortionOptions, given)
+        from sfm_shapefit.pipeline.workspace import workspace
 
-        if level not in LEVELS:
-            raise typer.BadParameter(f"--level must be one of {', '.join(LEVELS)}, got {level!r}")
-        with show_progress(not quiet) as progress:
-            made = workspace(source, folder, target, level=level, progress=progress)
+        with show_progress(not quiet, plan=PLANS["MODEL IMAGES OUT"]) as progress:
+            made = workspace(source, folder, target, options=options, progress=progress)
         if not quiet:
             print_lines(made.told)

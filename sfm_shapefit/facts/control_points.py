@@ -69,7 +69,7 @@ def control_warnings(
 ) -> Iterator[str]:
     """Yield what is wrong with the points or their marks, a sentence each; `names` are of the images."""
     if isinstance(fit, str):
-        yield f"{fit}: the model does not stand in the axes of the control points"
+        yield f"{fit}: the model is not in the axes of the control points"
     else:
         there = np.isfinite(fit.residuals[:, 0])
         errors = np.where(there & ~known.is_check & ~fit.fitting, np.linalg.norm(fit.residuals, axis=1), 0.0)

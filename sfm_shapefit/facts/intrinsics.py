@@ -168,7 +168,7 @@ def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
         ]
     parts += [f"{unknown} kept the given one, as the matches do not determine it"] if unknown else []
     parts += [f"{held} were not to be changed"] if held else []
-    return ["; ".join(parts) + "; each stands in locate.json"]
+    return ["; ".join(parts) + "; locate.json has each"]
 
 
 def _why(row: CameraIntrinsics) -> str:
@@ -198,6 +198,6 @@ def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
     loose = [row.label for row in adjusted if not (row.focal_sigma_px or np.inf) <= _LOOSE * row.focal_px]
     if loose:
         yield (
-            f"the matches hardly tell the focal length of {first_of(loose)} (± {_LOOSE:.0%} or more), so "
-            "images may stand too near to what they see, or too far from it; calibrate if that matters"
+            f"the matches hardly determine the focal length of {first_of(loose)} (± {_LOOSE:.0%} or more), "
+            "so cameras may be too near to what they see, or too far from it; calibrate if that matters"
         )

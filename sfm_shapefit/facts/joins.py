@@ -88,7 +88,7 @@ def _tell_join(labels: tuple[str, str], found: PieceJoin | str, rivals: list[tup
     if isinstance(found, str) or found.reason:
         why = found if isinstance(found, str) else found.reason
         return f"{own} is not joined to {other}: {why}" + (f" ({named})" if named else "")
-    rival = f"; {counted(len(rivals), 'pair')} would have it elsewhere ({named})" if named else ""
+    rival = f"; {counted(len(rivals), 'pair')} put it elsewhere ({named})" if named else ""
     return (
         f"{own} is joined to {other} by {found.evidence}: scale known to "
         f"{100.0 * found.scale_sigma:.2g} %, turn to {found.turn_sigma_deg:.2g} deg, its cameras to "

@@ -1,5 +1,7 @@
 """What the user should know of a placed model beyond its tables, in the order in which it is told.
 
+Images that are left out stand in the tables with the reason, and in the verdict.
+
 A new warning is a line here, and where that does not suffice a function above the list.
 """
 
@@ -15,7 +17,6 @@ from sfm_shapefit.facts.warnings import (
     prior_warnings,
     quality_warnings,
     support_warnings,
-    trust_warnings,
 )
 
 
@@ -26,11 +27,10 @@ def located_warnings(result: LocateResult, of_scale: Sequence[str]) -> Iterator[
     yield from intrinsics_warnings(result.intrinsics.rows(images))
     yield from match_warnings(result.directions, may_repeat=result.database is not None)
     yield from quality_warnings(result.placement, options.placement)
-    yield from trust_warnings(result.placement, result.kept)
     yield from ambiguity_warnings(result.placement)
     if result.model.num_points3D() == 0:
         yield f"{NO_POINTS}; bundle adjustment has nothing to start from"
     yield from prior_warnings(result.prior_fit, images.names)
     yield from of_scale
-    unsupported = [images.names[k] for k in np.flatnonzero(result.unsupported).tolist()]
-    yield from support_warnings(unsupported, is_kept=options.trust.min_trust == 0.0)
+    if options.trust.min_trust == 0.0:
+        yield from support_warnings([images.names[k] for k in np.flatnonzero(result.unsupported).tolist()])

@@ -175,7 +175,7 @@ class FactsOfModel(Facts):
         contradict = (
             f"{against[0]:,} of {counted(against[1], 'pair')} contradict{'s' * (against[1] == 1)} the result"
         )
-        contradict = contradict if against[1] else "no pair says where cameras stand"
+        contradict = contradict if against[1] else "no pair determines where cameras are"
         silent = self.num_pairs - against[1]
         if silent > against[1] > 0:
             contradict += f", and {silent:,} of {self.num_pairs:,} pairs say nothing of it"
@@ -273,6 +273,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         """Return what the terminal says; `left_out` has images and why, `centers` where centers come from."""
         rows = [
             Row("not placed", left_out),
+            row("not trusted", _how_to_keep(len(self.not_trusted))),
             *self.piece_rows(),
             *self.scene_rows(),
             Row("warning", self.warnings),
@@ -302,6 +303,16 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         contradicting, usable = counts.pop("outlier"), counts.pop("usable")
         others = [f"{count}: {DirectionStatus[status.upper()].value}" for status, count in counts.items()]
         return [f"{usable}: usable ({contradicting} contradict the solution)", *others]
+
+
+def _how_to_keep(num_not_trusted: int) -> str:
+    """Say how to keep images that are left out; empty if there are none."""
+    count = counted(num_not_trusted, "image")
+    return (
+        f"{count} of these; min_trust=0 keeps {'them' if num_not_trusted > 1 else 'it'}"
+        if num_not_trusted
+        else ""
+    )
 
 
 def next_of_model(grade: Grade, facts: FactsOfModel) -> NextStep:

@@ -48,7 +48,7 @@ def describe_loops(loops: Sequence[Loop]) -> str:
     lost = sum(loop.num_refused for loop in loops)
     said = f"{counted(pairs, 'pair')} far apart in their order"
     if not lost:
-        return f"{said}, used as the images between say the same"
+        return f"{said}, used, as the images between agree"
     worst = max(loops, key=lambda loop: (loop.num_refused, loop.num_matches))
     are, them = ("is", "it") if lost == 1 else ("are", "them")
     return (
@@ -62,7 +62,7 @@ def describe_line(sigma: float | None) -> str:
     if sigma is None:
         return ""
     return (
-        "the cameras stand on one line, along which only points determine lengths: positions along it are "
+        "the cameras are on one line, along which only points determine lengths: positions along it are "
         f"known to {100.0 * sigma:.2g}% of its length (standard deviation)"
     )
 

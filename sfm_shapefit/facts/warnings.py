@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.wording import counted_are, first_of
 from sfm_shapefit.judgement.grade import largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
@@ -127,27 +127,13 @@ def match_warnings(directions: PairDirections, *, may_repeat: bool) -> Iterator[
         )
 
 
-def trust_warnings(placement: Judged, kept: BoolArray) -> Iterator[str]:
-    """Yield which cameras are left out for want of trust, if any are."""
-    lost = np.flatnonzero(~kept)
-    if len(lost):
-        worst = _least_trusted(placement, lost)
-        why, above_all = ("they are", "above all ") if len(lost) > 1 else ("it is", "")
-        yield (
-            f"{counted_are(len(lost), 'camera')} left out because {why} not trusted, {above_all}{worst}; "
-            "min_trust=0 keeps what is left out"
-        )
-
-
-def support_warnings(names: Sequence[str], *, is_kept: bool) -> Iterator[str]:
-    """Yield which cameras are left out, or kept as was asked, though their matches make no points, if any."""
+def support_warnings(names: Sequence[str]) -> Iterator[str]:
+    """Yield which cameras are kept, as was asked, though their matches make no points, if any."""
     if names:
         rest = "its pose is" if len(names) == 1 else "their poses are"
-        what = "kept, as min_trust=0 asks, though" if is_kept else "left out because"
-        remedy = "" if is_kept else "; min_trust=0 keeps what is left out"
         yield (
-            f"{counted_are(len(names), 'camera')} {what} hardly any match makes a point with a third image: "
-            f"{first_of(names)}; {rest} wrong, or the scene repeats itself{remedy}"
+            f"{counted_are(len(names), 'camera')} kept, as min_trust=0 asks, though hardly any match makes a "
+            f"point with a third image: {first_of(names)}; {rest} wrong, or the scene repeats itself"
         )
 
 

@@ -27,7 +27,7 @@ _MIN_COLUMNS = 4  # columns; two ids and a direction in the plane
 def read_graph(path: Path | str) -> ViewGraph:
     """Read a bare view graph; the ids become its names, numbers in numerical order, else alphabetically.
 
-    Directions are normalized; a pair that stands twice is merged (see `ViewGraph`).
+    Directions are normalized; a pair that appears twice is merged (see `ViewGraph`).
 
     Raises:
         InputError: if the file cannot be read, naming the first malformed line by its number.

@@ -172,8 +172,8 @@ def _model_that_has(kind: str, family: str, distortion: dict[str, float], *, are
     return ""
 
 
-def nerf_text(images: Images, points_file: str = "") -> str:
-    """Return posed images as the text of a transforms.json, with the name of the file of their points.
+def nerf_text(images: Images, points_file: str = "", masks: str = "") -> str:
+    """Return posed images as the text of a transforms.json, with the names of its points and masks.
 
     Raises:
         InputError: if a camera model has no equivalent there.
@@ -188,9 +188,9 @@ def nerf_text(images: Images, points_file: str = "") -> str:
     frames: list[dict[str, Any]] = []
     for name, lens, matrix in zip(images.names, images.lens_of.tolist(), matrices, strict=True):
         of_frame = {} if shared and not images.lenses[0].is_panorama else intrinsics[lens]
-        frames.append(
-            {"file_path": f"images/{name}", **of_frame, "transform_matrix": (matrix + 0.0).tolist()}
-        )
+        mask = {"mask_path": f"{masks}/{name}.png"} if masks else {}
+        pose = {"transform_matrix": (matrix + 0.0).tolist()}
+        frames.append({"file_path": f"images/{name}"} | mask | of_frame | pose)
     points = {"ply_file_path": points_file} if points_file else {}
     return (
         json.dumps({**shared, **points, "frames": frames}, indent=2, ensure_ascii=False, allow_nan=False)

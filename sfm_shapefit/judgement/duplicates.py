@@ -47,7 +47,7 @@ def find_split_duplicates(
     split, most = is_among(pairs, found), np.zeros_like(most)
     np.maximum.at(most, pairs[split], apart[split, None])
     if len(named := np.flatnonzero(most)):
-        sentence = "a near duplicate that stands {} times the distance to its points away"
+        sentence = "a near duplicate that is {} times the distance to its points away"
         yield OddImages.of_values(Kind.PLACE, images.names_of(named), most[named], sentence)
 
 

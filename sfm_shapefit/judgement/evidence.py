@@ -9,7 +9,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import extent_of
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted, first_of, stand
+from sfm_shapefit.base.wording import are, counted, first_of
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, RIVAL_SHARE
 from sfm_shapefit.judgement.places import AmbiguousPlace
 from sfm_shapefit.judgement.reasons import Grade, Kind
@@ -77,8 +77,7 @@ class OpenShape(Record):
     def statement(self) -> str:
         """The same in a sentence."""
         return (
-            f"the points leave open where {counted(len(self.images), 'camera')} "
-            f"stand{'s' * (len(self.images) == 1)} ({first_of(self.images)}): with lenses and rotations free "
+            f"the points leave open where {are(self.images)}: with lenses and rotations free "
             f"they fit as well {how_far(self.largest)} away; calibrate the cameras, or add images that turn "
             "and cross"
         )
@@ -163,5 +162,7 @@ class ModelEvidence(Record):
         if self.shape is not None and self.shape.images:
             told.append(self.shape.statement)
         if self.contradicted:
-            told.append(f"{stand(self.contradicted)} where many pairs contradict, and no points confirm it")
+            told.append(
+                f"{are(self.contradicted)} contradicted by many pairs, and no points confirm the place"
+            )
         return told

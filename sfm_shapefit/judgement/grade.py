@@ -103,11 +103,13 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     if len(named - second.confirmed) > MOST_AGAINST * count and len(named) > len(apart):
         clause = f"evidence speaks against {len(named)} of {counted(count, 'camera')}"
         yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
-    elsewhere = "it stands elsewhere in the model that map made of the same matches"
+    elsewhere = "it is elsewhere in the model that map made of the same matches"
     yield from of_each(
         Kind.SECOND_OPINION, _without(second.wrong, apart), f"{elsewhere}, which pairs support"
     )
-    yield from of_each(Kind.SECOND_OPINION, second.undecided, f"{elsewhere}, and pairs support neither")
+    yield from of_each(
+        Kind.SECOND_OPINION, second.undecided, f"{elsewhere}, and no pairs support either place"
+    )
     yield from of_each(Kind.PLACE, places, OTHER_PLACE)
     if lenses:
         clause = f"images contradict {counted(len(lenses), 'focal length')}"
@@ -118,14 +120,14 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     yield from _weigh_oddities(evidence, count)
     for name in evidence.contradicted:
         num_pairs, num_against = evidence.contradictions[name]
-        clause = f"{num_against} of its {num_pairs} pairs contradict where it stands"
+        clause = f"{num_against} of its {num_pairs} pairs contradict its place"
         yield from of_each(Kind.PAIRS, [name], clause)
     if unchecked := _without([name for group in evidence.untied for name in group.images], apart):
-        clause = "nothing checks how groups of cameras stand to one another"
+        clause = "nothing checks where groups of cameras are relative to one another"
         if len(unchecked) == 1:
-            clause = "nothing checks how one camera stands to the rest"
+            clause = "nothing checks where one camera is relative to the rest"
         yield of_model(Kind.UNCHECKED, clause, images=unchecked)
-    clause = "at least half as much speaks for another place or rotation of it"
+    clause = "at least half as much evidence is for another place or rotation of it"
     yield from of_each(Kind.SECOND_OPINION, second.ambiguous, clause)
     if second.has_nothing_in_common:
         yield of_model(Kind.APART, "the model that map makes of the same matches has another shape")
@@ -171,7 +173,7 @@ def _find_apart(evidence: ModelEvidence) -> tuple[list[str], str]:
         groups.insert(0, second.wrong)
     clause = "{} stand apart from the rest"
     if len(loose) == len(groups):
-        clause = "nothing says how {} stand to the rest"
+        clause = "nothing says where {} are relative to the rest"
     return list(dict.fromkeys(name for group in groups for name in group)), clause
 
 
@@ -223,7 +225,7 @@ def _doubtful_cameras(placement: Judged) -> Iterator[Reason]:
 
 def in_another_model(here: float) -> Reason:
     """Say that a model has only a share of the images that stand in some model."""
-    return of_model(Kind.LEFT_OUT, f"{1.0 - here:.0%} of the images stand in another model")
+    return of_model(Kind.LEFT_OUT, f"{1.0 - here:.0%} of the images are in another model")
 
 
 def _weigh_shares(shares: Shares) -> Iterator[Reason]:

@@ -25,7 +25,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, median_spread, rotation_angles_deg
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted, rounded, stand
+from sfm_shapefit.base.wording import are, counted, rounded
 from sfm_shapefit.judgement.limits import (
     FEWEST_ALIKE,
     LOCAL_SHARE,
@@ -93,19 +93,19 @@ class SecondOpinion(Record):
         parts = []
         if self.wrong:
             parts.append(
-                f"{stand(self.wrong)} elsewhere {by}: "
-                f"{counted(self.num_against, 'pair')} support that, {self.num_for} this model"
+                f"{are(self.wrong)} elsewhere {by}: "
+                f"{counted(self.num_against, 'pair')} support that place, {self.num_for} the one here"
             )
         if self.undecided:
-            parts.append(f"{stand(self.undecided)} elsewhere {by}, and pairs support neither")
+            parts.append(f"{are(self.undecided)} elsewhere {by}, and no pairs support either place")
         if self.ambiguous:
-            where = f"{stand(self.ambiguous)} in the same place {by}"
-            parts.append(f"{where}, but at least half as much speaks for another place or rotation")
+            where = f"{are(self.ambiguous)} in the same place {by}"
+            parts.append(f"{where}, but at least half as much evidence is for another place or rotation")
         percent = rounded(100.0 * self.usual, digits=2) if self.usual > _LEAST_TOLD else "less than 0.001"
         usual = f"positions differ by {percent} % of their spread, median"
         if self.has_nothing_in_common:
-            return f"{self.num_common} cameras have nothing in common with where they stand {by} ({usual})"
-        told = "; ".join(parts) or f"{self.num_common} cameras stand in the same place {by}"
+            return f"{self.num_common} cameras have nothing in common with their places {by} ({usual})"
+        told = "; ".join(parts) or f"{self.num_common} cameras are in the same place {by}"
         return f"{told} ({usual})"
 
 

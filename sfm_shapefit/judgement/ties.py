@@ -29,7 +29,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, rows_taken, sum_by
 from sfm_shapefit.base.forests import connected_components
-from sfm_shapefit.base.wording import counted, stand
+from sfm_shapefit.base.wording import are, counted
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.few_ties import are_bridges
 from sfm_shapefit.judgement.limits import FEWEST_ALIKE, FEWEST_POINTS, OUTNUMBERED
@@ -57,8 +57,8 @@ class UntiedGroup(CameraGroup):
         agree = f"{counted(self.num_agreeing, 'pair')} and {counted(self.num_points, 'point')}"
         against = f"{counted(self.num_contradicting, 'pair')} contradict"
         return (
-            f"nothing {does} how {stand(self.images)} to the rest: {agree} between them agree, {against}; "
-            "match more images across"
+            f"nothing {does} where {are(self.images)} relative to the rest: {agree} between them agree, "
+            f"{against}; match more images across"
         )
 
 

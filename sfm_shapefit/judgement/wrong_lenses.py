@@ -101,7 +101,7 @@ class ContradictedLens(Record):
         who = "its image asks" if self.num_images == 1 else f"its {self.num_images} images ask"
         return (
             f"the focal length of {self.label} is wrong: {who} for {asked}, not {self.focal_px:,.0f} "
-            f"px, by the points that the others make; its images stand wrong by that: {self.remedy}"
+            f"px, by the points that the others make; its images are wrong by that: {self.remedy}"
         )
 
 

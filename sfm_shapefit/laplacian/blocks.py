@@ -13,7 +13,7 @@ _SEED = 1  # seed of METIS; the same input gives the same blocks
 def cut_graph(num_nodes: int, edges: IntArray, weights: FloatArray, size: int) -> IntArray:
     """Return the block of each node, (n,), numbered without gaps: blocks of about `size` nodes, by METIS.
 
-    Few edges (m, 2) of large weight (m,) are cut; no edge stands twice.
+    Few edges (m, 2) of large weight (m,) are cut; no edge appears twice.
     """
     count = -(-num_nodes // size)
     if count <= 1 or not len(edges):

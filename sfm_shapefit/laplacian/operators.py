@@ -240,7 +240,8 @@ class LaplacianOperator:
 
     def reweigh(self, weights: FloatArray) -> None:
         """Take other weights, (m,), in place of those before."""
-        _write_entries(self.graph.edge_of, weights, self._entries)
+        rounded = weights.astype(np.float32, copy=False)
+        np.take(rounded, self.graph.edge_of, out=self._entries, mode="clip")
 
     def diagonal(self) -> FloatArray:
         """Return the weighted degree of each node, (n,)."""
@@ -259,12 +260,6 @@ class LaplacianOperator:
 
         self._workers.share(graph.pointers, work, _ENTRIES_WORTH_A_THREAD)
         return out
-
-
-@kernel
-def _write_entries(edge_of: Any, weights: Any, out: Any) -> None:
-    for p in range(len(out)):
-        out[p] = weights[edge_of[p]]
 
 
 @kernel

@@ -20,7 +20,7 @@ class DirectionStatus(enum.Enum):
     LOW_INLIER_RATIO = "most matches contradict the rotations"
     NO_PARALLAX = "no parallax: the matches do not determine the direction"
     TWO_MOTIONS = "the matches agree on two different directions"
-    AMBIGUOUS_SIGN = "points lie in front of the cameras for either sign of the direction"
+    AMBIGUOUS_SIGN = "points are in front of the cameras whichever way the direction points"
 
 
 # Good rotations leave so much in any direction; matches that promise more are no better.

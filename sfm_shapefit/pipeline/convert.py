@@ -50,6 +50,9 @@ FORMATS = {
 }
 
 _FOLDERS = {"colmap", "colmap-txt"}
+_SUFFIXES = ", ".join(
+    f"{' or '.join(one.suffixes)} ({name})" for name, one in FORMATS.items() if any(one.suffixes)
+)
 
 
 def convert(
@@ -161,7 +164,8 @@ def _contents(name: str, scene: _Scene) -> dict[str, bytes]:
     """Return the content of each file, by what its name has behind the target's stem: also another suffix."""
     images, world = scene.model.images, scene.world
     if name == "nerf" and scene.model.num_points:
-        return _with_points(scene)
+        beside = f"{scene.stem}{_POINTS}"
+        return dict(zip(("", _POINTS), nerf_files(scene.model, beside), strict=True))
     if name == "ply":
         return _points_and_cameras(scene)
     if name == "glb":
@@ -193,14 +197,22 @@ def _points_and_cameras(scene: _Scene) -> dict[str, bytes]:
     }
 
 
-def _with_points(scene: _Scene) -> dict[str, bytes]:
+def nerf_files(model: "ColmapModel", points_file: str, masks: str = "") -> tuple[bytes, bytes]:
+    """Return the transforms.json of a model, and the PLY of all its points, to which it refers by that name.
+
+    Args:
+        model: in lenses that transforms.json knows.
+        points_file, masks: the file of the points and the folder of masks as seen from the transforms.json;
+            without masks its frames have none.
+    """
     from sfm_shapefit.files.colmap.seed import pick_points
     from sfm_shapefit.files.nerf import nerf_text
     from sfm_shapefit.report.mesh import ply_bytes
 
-    points = pick_points(scene.model.arrays, scene.model.num_points)
-    text = nerf_text(scene.model.images, f"{scene.stem}{_POINTS}")
-    return {"": text.encode(errors="backslashreplace"), _POINTS: ply_bytes(points.xyz, points.colors)}
+    points = pick_points(model.arrays, model.num_points)
+    text = nerf_text(model.images, points_file, masks)
+    ply = ply_bytes(points.xyz, points.colors, with_normals=True)
+    return text.encode(errors="backslashreplace"), ply
 
 
 def _covariances(scene: _Scene) -> str:
@@ -233,7 +245,9 @@ def _format_of(path: Path) -> str:
     for name, one in FORMATS.items():
         if path.suffix.lower() in one.suffixes:
             return name
-    raise InputError(f"{path} has no known suffix; give the format: {', '.join(FORMATS)}")
+    raise InputError(
+        f"no format has the suffix of {path}; name it {_SUFFIXES}, or a folder, or name the format"
+    )
 
 
 def _trust_of(source: "ModelSource") -> dict[str, float]:

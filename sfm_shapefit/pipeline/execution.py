@@ -11,6 +11,7 @@ The work of a worker that dies is given to another one, by dask. Whoever can rea
 its workers: keep it inside a trusted network.
 """
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +21,6 @@ from sfm_shapefit import __version__
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import MissingExtraError
 from sfm_shapefit.base.executors import Answer, WorkerError
-from sfm_shapefit.base.wording import counted
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, MatchPart, View
 
@@ -40,7 +40,9 @@ class DaskWorkers(NamedTuple):
 
     def submit(self, work: Callable[..., Answer], *given: Any) -> Any:
         """Return a future of `work(*given)`; what dies with a worker is computed again by another one."""
-        return self.client.submit(work, *given, pure=False, retries=_RETRIES)
+        with warnings.catch_warnings():  # dask warns of tasks of more than 10 MB, and few are
+            warnings.filterwarnings("ignore", message="Sending large graph")
+            return self.client.submit(work, *given, pure=False, retries=_RETRIES)
 
 
 def workers_of(client: "Client | None", file: Path | str | None) -> DaskWorkers | None:
@@ -53,15 +55,17 @@ def workers_of(client: "Client | None", file: Path | str | None) -> DaskWorkers 
     if client is None:
         return None
     here = _look_at(file if file is None else str(Path(file).absolute()))
-    seen: dict[str, Any] = client.run(_look_at, here.path)
+    seen: dict[str, Any] = client.run(_look_at, here.path, on_error="return")
     if not seen:
         raise WorkerError("the dask scheduler has no worker; start one: dask worker ADDRESS")
-    others = {name: there for name, there in seen.items() if there != here}
-    for name, there in others.items():
-        of = f"{counted(len(others), 'worker')} of {len(seen)}, {name} the first,"
-        if there.version != here.version:
-            raise WorkerError(f"{of} has sfm_shapefit {there.version}, not {here.version}; install the same")
-        raise WorkerError(f"{of} does not see {here.path} as it is here; share the folder, by the same path")
+    for name, there in seen.items():
+        if not isinstance(there, _Seen) or there.version != here.version:
+            has = f"sfm_shapefit {there.version}" if isinstance(there, _Seen) else "no sfm_shapefit"
+            raise WorkerError(f"the worker {name} has {has}; install version {here.version} there")
+        if there != here:
+            raise WorkerError(
+                f"the worker {name} does not see {here.path} as it is here; share it by the same path"
+            )
     return DaskWorkers(client)
 
 

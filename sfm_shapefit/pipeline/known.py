@@ -11,9 +11,7 @@ from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.command_options import FIX_SOLVED, Rotations
 from sfm_shapefit.files.colmap.control_points import read_control_points
-from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.files.colmap.scale_bars import read_scale_bars
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.lines import text_of
@@ -46,6 +44,8 @@ def read_known(
 
 
 def _read_priors(images: Images, file: DatabaseFile | None, source: Path | str) -> PositionPriors:
+    from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors  # few are given
+
     if str(source) == PRIORS_OF_DATABASE:
         if file is None:
             raise InputError("there is no database whose priors could be taken; give one (database=FILE)")
@@ -61,6 +61,8 @@ def _read_control(images: Images, file: str) -> ControlPoints:
 
 
 def _read_gravity(images: Images, file: DatabaseFile | None, source: str) -> Gravity:
+    from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity  # few are given
+
     if source != GRAVITY_OF_DATABASE:
         return table_gravity(Path(source), images)
     if file is None:

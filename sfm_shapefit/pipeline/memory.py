@@ -10,12 +10,12 @@ known. What can be given up is listed in `MEMORY_PLANS`, the cheapest first; the
 """
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.command_options import InspectOptions, PlacingOptions
-from sfm_shapefit.facts.inspected import Forecast
 from sfm_shapefit.files.colmap.database import MOST_KEYPOINTS, PIXEL_BYTES
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -26,6 +26,9 @@ from sfm_shapefit.placement.memory_plan import MEMORY_PLANS, MemoryPlan
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.matches import KEPT_MATCHES, MOST_BESIDE_TRACKS
 from sfm_shapefit.solver.solve import choose_method, plan_factor
+
+if TYPE_CHECKING:
+    from sfm_shapefit.facts.inspected import Forecast
 
 _MB = 1e6  # bytes; as users count them
 _STARTED_BYTES = 195e6  # bytes; the interpreter with all that `locate` imports
@@ -67,8 +70,10 @@ class Workload:
     """Whether the factor cannot be given up, since the solve itself works with it."""
 
 
-def forecast(work: Workload, plan: MemoryPlan = MEMORY_PLANS[0]) -> Forecast:
+def forecast(work: Workload, plan: MemoryPlan = MEMORY_PLANS[0]) -> "Forecast":
     """Return what a run will take, if so much is given up for memory."""
+    from sfm_shapefit.facts.inspected import Forecast  # here: few runs have a limit
+
     memory_mb = {stage: size / _MB for stage, size in _peaks(work, plan).items()}
     return Forecast(memory_mb=memory_mb, peak_mb=max(memory_mb.values()))
 

@@ -91,7 +91,7 @@ def _at_known_scale(pieces: Sequence[ModelPiece], join: PieceJoin) -> PieceJoin:
     if not all(one.model.images.has_rigs for one in two):
         return replace(join, reason="only one of them has rigs of several cameras, and a scale by that")
     if not all(one.is_metric for one in two):
-        return replace(join, reason="their rigs do not tell the scale of both")
+        return replace(join, reason="their rigs do not give the scale of both")
     sigma = float(np.linalg.norm([one.scale_sigma or 0.0 for one in two]))
     # Errors of the size of the second model move its cameras about their middle.
     center_sigma = float(np.hypot(join.center_sigma, sigma * median_spread(two[1].model.images.centers)))

@@ -36,7 +36,7 @@ def rigs_statement(images: Images, measured: MeasuredGraph) -> str:
         return "none: every image is a frame of its own"
     frames = f"{len(images.frames.ids)} frames of {images.num_images} images"
     if not measured.has_scale:
-        return f"{frames}; no pair sees two cameras of a frame that stand apart, so their scale is open"
+        return f"{frames}; no pair sees two cameras of a frame that are apart, so their scale is open"
     sizes = measured.cameras_per_group
     tied = int(np.sum(sizes[largest_tied(edges, groups, sizes)] > 0))
     return f"{frames}, of which the pairs tie {tied} in metric scale; the pieces below take images one by one"

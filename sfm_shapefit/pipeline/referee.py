@@ -335,12 +335,12 @@ def _reasons(state: CheckState) -> Iterator[Reason]:
     pointless = not (model.num_points or structure.points.num_points)
     centers = model.images.centers
     if np.ptp(centers, axis=0).max() <= _ROUNDING * np.abs(centers).max():
-        clause = "all its cameras stand at the same place; place them with sfm-shapefit locate"
+        clause = "all its cameras are at the same place; place them with sfm-shapefit locate"
         yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
         return
     if fits is None or not (fits.contradicts.any() or np.isfinite(fits.residuals_deg).any()):
         is_bare = pointless and not source.inputs.database
-        clause = "no two of its images have matches that say how they stand to each other"
+        clause = "no two of its images have matches that say where they are relative to each other"
         clause = "it has no 3D points, and no database was given or found" if is_bare else clause
         yield of_model(Kind.UNCHECKED, clause, Grade.CANNOT_BE_JUDGED)
     yield from too_few_to_judge(model.images.num_images)
@@ -350,7 +350,7 @@ def _reasons(state: CheckState) -> Iterator[Reason]:
         yield from _none_agrees(fits, source)
     yield from (one for one in state.weak if not evidence.opinion.confirmed.issuperset(one.images))
     if pointless:
-        clause = "it has no 3D points, so that only matches say where its cameras stand"
+        clause = "it has no 3D points, so that only matches support where its cameras are"
         yield of_model(Kind.POINTS, clause)
     if num_missing := len(source.matches.missing_names):
         clause = f"the database lacks {counted(num_missing, 'image')}: {IS_ITS_DATABASE}"

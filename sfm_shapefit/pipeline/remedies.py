@@ -56,7 +56,7 @@ class Remedy(NamedTuple):
         ids = {result.placed.lenses[row].id for row in self.freed}
         lenses = [row for row in result.intrinsics.rows(result.placed) if row.camera in ids]
         changed = "; ".join(describe_intrinsics(lenses))
-        why = "images contradicted what was given, unless --intrinsics held"
+        why = "images contradicted what was given (--intrinsics held keeps that)"
         done = [f"{changed}: {why}"] if lenses else []
         if self.moved:
             done.append(f"{', '.join(self.moved)}: placed without the pairs that twice as many contradict")

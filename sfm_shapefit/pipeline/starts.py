@@ -34,12 +34,9 @@ from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
 from sfm_shapefit.pipeline.measure import MeasureRequest, measure, wants_points
 from sfm_shapefit.pipeline.placing import PlacingSetup, place_first
-from sfm_shapefit.pipeline.relative_rotations import estimate_here
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 from sfm_shapefit.placement.place import InitialPlacement
-from sfm_shapefit.rotations.average import average_relative_rotations
-from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.scene.images import Images
 
 _NEAR = 6.0  # standard deviations of an image that a pair may turn by; two images and three axes give 5.7
@@ -157,6 +154,8 @@ def _measure(
     without: IntArray | None = None,
 ) -> RelativeRotations:
     """Return the relative rotations of pairs, but for some of them; by trials, as `map` does, if None."""
+    from sfm_shapefit.pipeline.relative_rotations import estimate_here  # here: few rotations are rough
+
     view = source.matches.at(source.images.apart(), source.inputs.left_out)
     are_many = have_many_pairs(view.images.num_images, view.num_pairs)
     estimate = estimate or partial(estimate_relative_rotations, are_many=are_many)
@@ -168,6 +167,9 @@ def average_near(rough: Images, relative: RelativeRotations, threads: int) -> Im
 
     Images that no pair ties to the largest component keep their own.
     """
+    from sfm_shapefit.rotations.average import average_relative_rotations  # here: few rotations are rough
+    from sfm_shapefit.rotations.frames import relative_rotations_of_frames
+
     given, sensors = rough.frames.rotations, rough.sensors.rotations[rough.lens_of]
     of_frames = relative_rotations_of_frames(relative, rough.frame_of, sensors)
     if not len(of_frames.pairs):

@@ -1,17 +1,18 @@
 """`workspace`: pictures and model without distortion, in the folders that splatting and dense programs read.
 
 OUT/images/              pictures, all in one folder
+OUT/masks/               their masks, NAME.png for NAME, if there are any: brush, LichtFeld, COLMAP's fusion
 OUT/sparse/0/            the model, and its points as points3D.ply: 3DGS, gsplat, brush, LichtFeld
 OUT/sparse/, OUT/stereo/ the model again and the plan of the stereo: COLMAP's dense commands, OpenMVS
-OUT/transforms.json      cameras, and the name of the points: nerfstudio
+OUT/transforms.json      cameras, and the names of points and masks: nerfstudio
 """
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,24 +21,22 @@ from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, angle_between_deg
 from sfm_shapefit.base.paths import refuse_no_folder
+from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.base.wording import counted, counted_are, first_of
 from sfm_shapefit.facts.tables import model_datum
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, model_of, read_model
 from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
-from sfm_shapefit.files.colmap.pinholes import flats_of, flatten_model, write_flats
+from sfm_shapefit.files.colmap.pinholes import Flat, flats_of, flatten_model, mask_of, write_flats
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
-from sfm_shapefit.files.nerf import nerf_text
-from sfm_shapefit.report.mesh import ply_bytes
+from sfm_shapefit.files.undistortion_options import UndistortionOptions
+from sfm_shapefit.pipeline.convert import nerf_files
 from sfm_shapefit.rotations.gravity import DOWN, turn_upright
 from sfm_shapefit.scene.level import find_up
 
 if TYPE_CHECKING:
     import pycolmap
-
-Level = Literal["auto", "never"]
-LEVELS: tuple[Level, ...] = get_args(Level)
 
 _LEVEL_DEG = 5.0  # degrees; a model whose z axis is no farther from up has it from GPS, gravity or its maker
 _ROUGH_DEG = 3.0  # degrees, standard deviation; ground that is tilted by more is seen to be
@@ -73,55 +72,72 @@ def workspace(
     images: Path | str,
     out: Path | str,
     *,
-    level: Level = "auto",
+    options: UndistortionOptions | None = None,
     progress: Progress | None = None,
+    **overrides: Any,
 ) -> Workspace:
     """Write pictures and model without distortion for splatting and dense reconstruction.
 
-        sfm_shapefit.workspace("mapped/0", "images", "dense")
+        sfm_shapefit.workspace("mapped/0", "images", "dense", mask_path="masks", max_image_size=1600)
 
     Args:
         model: a result, a reconstruction, a model folder or a list of poses with lenses; it is not changed.
         images: folder of its pictures. Panoramas and wide fisheyes are cut to faces, which form rigs.
         out: the folder to be made.
-        level: "auto" turns the world so that z points up, by what pictures and ground points say, unless
-            priors or gravity did; "never" keeps its axes.
+        options: settings, see `help(UndistortionOptions)`; defaults if None.
         progress: called as stages advance.
+        **overrides: single options by name.
 
     Raises:
-        InputError: if the model or all pictures cannot be read, or `out` exists or cannot be written.
+        InputError: if the model cannot be read, no picture or mask is one of it, or `out` exists or cannot be
+            written.
     """
-    if level not in LEVELS:
-        raise InputError(f"level must be auto or never, got {level!r}")
-    refuse_no_folder(Path(images))
+    options = merge_options(options, UndistortionOptions, overrides)
+    masks = Path(options.mask_path) if options.mask_path else None
+    for given in filter(None, (Path(images), masks)):
+        refuse_no_folder(given)
     clock = Clock.of(progress)
     with clock("read"):
         read = read_by_itself(model_of(model), with_lenses=True)
-        turn, statement = _level(read, model) if level == "auto" else (None, "its axes stay, as asked")
+        turn, statement = (
+            _level(read, model) if options.level == "auto" else (None, "its axes stay, as asked")
+        )
         leveled = read.reconstruction if turn is None else transform_model(read.reconstruction, turn)
-    protect = [images, *([model] if isinstance(model, Path | str) else [])]
+    protect = [images, *([model] if isinstance(model, Path | str) else []), *([masks] if masks else [])]
     with atomic_folder(out, protect=protect) as folder:
         with clock("pictures"):
-            (folder / "images").mkdir()
-            flats, missing = flats_of(leveled, Path(images))
+            flats, missing = flats_of(leveled, Path(images), options.max_image_size)
+            _refuse_no_masks(flats, masks)
+            for name in ("images", "masks") if masks else ("images",):
+                (folder / name).mkdir()
             reasons = dict.fromkeys(missing, "no picture")
-            for done, why in enumerate(write_flats(flats, folder / "images", clock.threads)):
+            for done, why in enumerate(write_flats(flats, folder, clock.threads, masks)):
                 reasons |= {flats[done].name: why} if why else {}
                 clock.advance(done + 1, len(flats))
             flats = [flat for flat in flats if flat.name not in reasons]
-            if not flats:
+            if len(flats) < 2:
                 name, why = next(iter(reasons.items()))
+                count = "only one" if flats else "no"
                 raise InputError(
-                    f"{images} has no picture of the model ({name}: {why}); give the folder of those that it "
-                    "was made of"
+                    f"{images} has {count} picture of the model ({name}: {why}); give the folder of those "
+                    "that it was made of"
                 )
         with clock("model"):
             colored, _ = color_model(leveled, PictureFolder(Path(images), clock.threads))
             made = flatten_model(colored, flats)
-            _write_models(read_model(made), folder)
+            _write_models(read_model(made), folder, "masks" if masks else "")
     return Workspace(
         folder=Path(out), reconstruction=made, level=statement, warnings=(*read.notes, *_warn(made, reasons))
     )
+
+
+def _refuse_no_masks(flats: Sequence[Flat], masks: Path | None) -> None:
+    """Raise InputError if no image has a mask in a folder of masks."""
+    if masks and flats and not any(mask_of(masks, flat.name) for flat in flats):
+        raise InputError(
+            f"{masks} has no mask of the {counted(len(flats), 'image')}; that of {flats[0].name} is to be "
+            f"{flats[0].name}.png there"
+        )
 
 
 def _warn(made: "pycolmap.Reconstruction", reasons: Mapping[str, str]) -> Iterator[str]:
@@ -151,16 +167,15 @@ def _level(read: ColmapModel, source: ModelSource) -> tuple[Similarity | None, s
     return turn, f"leveled, z points up; up is {known}"
 
 
-def _write_models(model: ColmapModel, folder: Path) -> None:
+def _write_models(model: ColmapModel, folder: Path, masks: str) -> None:
     sparse, stereo = folder / "sparse", folder / "stereo"
     (sparse / "0").mkdir(parents=True)
     write_model(model.reconstruction, sparse / "0")
     for file in (sparse / "0").iterdir():
         shutil.copyfile(file, sparse / file.name)
-    points = pick_points(model.reconstruction, model.reconstruction.num_points3D())
-    (sparse / "0" / _POINTS).write_bytes(ply_bytes(points.xyz, points.colors, with_normals=True))
-    text = nerf_text(model.images, f"sparse/0/{_POINTS}")
-    (folder / "transforms.json").write_bytes(text.encode(errors="backslashreplace"))
+    transforms, points = nerf_files(model, f"sparse/0/{_POINTS}", masks)
+    (sparse / "0" / _POINTS).write_bytes(points)
+    (folder / "transforms.json").write_bytes(transforms)
     for name in _STEREO:
         (stereo / name).mkdir(parents=True)
     names = [f"{name}\n" for name in model.images.names]

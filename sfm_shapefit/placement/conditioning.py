@@ -38,7 +38,7 @@ class Looseness(enum.Enum):
     UNTIED = "no agreeing pairs tie it to the others rigidly"
     FEW_PAIRS = "two agreeing pairs or fewer hold it"
     PARALLEL = "the directions of its agreeing pairs are nearly parallel"
-    ON_A_LINE = "it stands on a straight stretch, along which nothing fixes the spacing"
+    ON_A_LINE = "it is on a straight stretch, along which nothing fixes the spacing"
     DISTANCE = "its directions leave its distance open"
     TOGETHER = "it moves with its neighbors, which the rest does not hold"
 

@@ -57,6 +57,6 @@ def find_fixed_and_rigged(images: Images, fixed: BoolArray | None = None) -> Fix
         return FixedAndRigged(fixed, groups, None)
     if count > 1 and not images.has_rigs and coincide(images.centers[fixed]):
         raise InputError(
-            f"the {count} fixed cameras stand at one place in the input; fix others, whose positions it has"
+            f"the {count} fixed cameras are at one place in the input; fix others, whose positions it has"
         )
     return FixedAndRigged(fixed, groups.with_fixed(fixed, images.centers), 0)

@@ -113,7 +113,7 @@ def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
             f"the input's centers are {off:.0%} of their spread off the answer, so the scale taken from them "
             "is rough; give scale=unit if they mean nothing"
         )
-    statement = "input: scale and origin of the input's centers, its axes"
+    statement = "input: scale, origin and axes are the input's"
     return Gauge(similarity=similarity, scale="input", statement=statement, warning=warning)
 
 

@@ -112,7 +112,7 @@ def uncertainty(scale_sigma: float, turn_sigma_deg: float, center_sigma: float) 
     if turn_sigma_deg > _LARGEST_TURN_SIGMA_DEG:
         return f"the turn between them is known to {turn_sigma_deg:.2g} deg only"
     if center_sigma > _LARGEST_CENTER_SIGMA:
-        return f"where one stands beside the other is known to {center_sigma:.0%} of its size only"
+        return f"where one is beside the other is known to {center_sigma:.0%} of its size only"
     return ""
 
 

@@ -593,7 +593,7 @@ def choose_start(
     if len(starts) == 1:
         return by_name["ShapeFit"], f"the starts' lengths differ by {apart:.1%}, so that only one is refined"
     if _is_point(graph, by_name["ShapeFit"].best) and not _is_point(graph, by_name["LUD"].best):
-        return by_name["LUD"], "most cameras of the other start stand in one point"
+        return by_name["LUD"], "most cameras of the other start are in one point"
     difference = costs["LUD"] - costs["ShapeFit"]
     name = "LUD" if difference < -ALIKE * costs["ShapeFit"] else "ShapeFit"  # not as rounding has it
     if apart <= COLLAPSED:

@@ -361,7 +361,7 @@ def _notes(drawing: Drawing, residuals_deg: Mapping[str, FloatArray]) -> dict[st
         "matrix": _matrix_note(-(-len(drawing.cameras.names) // MOST_CELLS)),
         "support": _support_note(drawing),
         "convergence": _convergence_note(drawing),
-        "loops": "Pairs far apart in their order are used where the images between say the same.",
+        "loops": "Pairs far apart in their order are used where the images between agree.",
         "control": "The position in the model minus the known one; check points do not set scale and axes.",
         "pieces": "Nothing fixes size and place of one piece against another; they share the cameras named.",
     }

@@ -25,7 +25,6 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
-from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
 
 # A running number and what surrounds it; at most 255 digits, as Python reads no integer of more than 4,300.
@@ -135,6 +134,8 @@ def judge_loops(videos: Videos, names: Sequence[str], relative: RelativeRotation
 
     Other pairs are not judged.
     """
+    from sfm_shapefit.rotations.average import average_relative_rotations  # here: few models are videos
+
     is_loop = loop_pairs(videos, relative)
     judged: list[Loop] = []
     refused = [np.zeros(0, dtype=np.int64)]

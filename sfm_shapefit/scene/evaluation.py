@@ -326,7 +326,7 @@ def _refuse_coincident(owner: str, centers: FloatArray) -> None:
     rounding = 1e-12 * float(np.abs(centers).max())
     if float(np.ptp(centers, axis=0).max()) <= rounding:
         raise InputError(
-            f"all common cameras of {owner} stand at one point, so nothing can be aligned; place them first"
+            f"all common cameras of {owner} are at one point, so nothing can be aligned; place them first"
         )
 
 

@@ -27,19 +27,19 @@ class FreedomOptions(Settings):
 
     adjust: Adjust = option(
         "seed",
-        'Whether poses and points are bundle adjusted once ("seed"), twice ("full") or not ("none"): first '
-        "by all tracks, with rotations as far as they are in doubt (up to 2,000 cameras); then all freely.",
+        'Bundle adjustment: "seed" adjusts positions and points by all tracks, and rotations as far as they '
+        'are in doubt (up to 2,000 cameras); "full" then adjusts all once more, freely; "none" nothing.',
     )
     intrinsics: IntrinsicsFreedom = option(
         "auto",
         'Intrinsics that the adjustments change: "auto", focal length and distortion of cameras that were '
         'never calibrated (COLMAP\'s guess, or EXIF data); "focal", the focal lengths of all cameras; "all", '
-        'their distortion too; "held", nothing. What was given pulls by its own weight, and stays where the '
-        "matches do not determine it. Cameras that images share stay shared.",
+        'their distortion too; "held", nothing. Given values count by their own uncertainty, and stay where '
+        "the matches do not determine them. Cameras that images share stay shared.",
     )
     rigs: RigFreedom = option(
         "held",
-        'Where sensors stand in their rigs: "held", where they are; "free", refined, one pose for all frames '
+        'Poses of the sensors in their rigs: "held", as they are; "free", refined, one pose for all frames '
         "each. The reference sensors stay, and so does the mean distance of the others "
         "from them: the scale is still that of the rigs. Refused where the matches do not "
         "determine a sensor's pose.",

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -30,14 +30,14 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 def differences(t: FloatArray, edges: IntArray) -> FloatArray:
     """Return D T, the baselines t_i - t_j, shape (m, d)."""
     baselines = np.empty((len(edges), t.shape[1]))
-    _differences(t, edges, baselines)
+    _differences(frozen(t), frozen(edges), baselines)  # arrays that can be written cost another compilation
     return baselines
 
 
 def adjoint(y: FloatArray, edges: IntArray, num_nodes: int) -> FloatArray:
     """Return D^T y, at every node the sum of its incident signed y_e, shape (n, d)."""
     total = np.zeros((num_nodes, y.shape[1]))
-    _add_adjoint(y, edges, total)
+    _add_adjoint(y, frozen(edges), total)
     return total
 
 

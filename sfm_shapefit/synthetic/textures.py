@@ -1,6 +1,6 @@
 """What the surfaces of a rendered scene look like: painted pictures, full of corners and blobs.
 
-A feature detector asks for structure at every scale and for nothing that stands twice. So every picture is
+A feature detector asks for structure at every scale and for nothing that appears twice. So every picture is
 stones of many sizes over clouded ground, and facades have windows on top, each with its own reflections.
 """
 

@@ -43,7 +43,7 @@ class NodeOptions(Settings):
 @explained
 @dataclass(frozen=True, kw_only=True)
 class StructureOptions(Settings):
-    """What a 3D point must satisfy to stand in the output."""
+    """What a 3D point must satisfy to be in the output."""
 
     max_reprojection_error_px: float = option(
         4.0, "Observations with a larger reprojection error are removed, and points that lose all but one."

@@ -15,7 +15,7 @@ for the middle point.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -32,6 +32,7 @@ from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTra
 # Observations between which Python can be interrupted: about 0.1 s.
 _SLICE = 100_000
 _SLICES_A_THREAD = 4  # slices of tracks at least; with one, long tracks would hold up the others
+_JOINED_AT_ONCE = 2_000_000  # observations whose pixels are put together; they take 100 MB
 _PAIRS = 15  # pairs of observations that are tried for each point; all of six observations
 _STEPS = 5  # Gauss-Newton steps for a point; they begin within the limit of its observations
 _STILL = 1e-9  # length of a step over the distance of the point; the steps end with a shorter one
@@ -161,13 +162,11 @@ def triangulate_matches(
         parts.append((points, RowLists(seen.offsets, rows[seen.rows])))
         is_left = np.ones(len(rows), dtype=np.bool_)
         is_left[seen.rows] = False
-    lengths = np.concatenate([seen.lengths() for _, seen in parts])
-    tracks = RowLists(offsets_of(lengths), np.concatenate([seen.rows for _, seen in parts]))
-    every = np.arange(len(lengths))
+    tracks = _concatenate([seen for _, seen in parts])
     return matched.observed(tracks), TriangulatedPoints(
         points=np.concatenate([points for points, _ in parts]),
-        tracks=every,
-        points_seen=np.repeat(every, lengths),
+        tracks=np.arange(len(tracks.offsets) - 1),
+        points_seen=tracks.list_of_rows(),
     )
 
 
@@ -183,8 +182,21 @@ def _triangulate_joined(
     matched: MatchedKeypoints, joined: RowLists, poses: CameraPoses, limits: PointLimits, threads: int
 ) -> tuple[FloatArray, RowLists]:
     """Return the points (k, 3) of joined keypoints, and the rows that see each."""
-    found = triangulate_tracks(matched.observed(joined), poses, limits, threads)
-    return found.points, joined.of(RowLists.by_label(found.points_seen))
+    number, total = -(-len(joined.rows) // _JOINED_AT_ONCE) or 1, len(joined.rows)
+    cuts = np.searchsorted(joined.offsets, np.arange(1, number) * total // number).tolist()
+    points, seen = list[FloatArray](), list[RowLists]()
+    for tracks in pairwise([0, *cuts, len(joined.offsets) - 1]):
+        own = joined.subset(np.arange(*tracks))
+        found = triangulate_tracks(matched.observed(own), poses, limits, threads)
+        points.append(found.points)
+        seen.append(own.of(RowLists.by_label(found.points_seen, len(found.points))))
+    return np.concatenate(points), _concatenate(seen)
+
+
+def _concatenate(parts: Sequence[RowLists]) -> RowLists:
+    """Return the lists of all parts."""
+    lengths = np.concatenate([part.lengths() for part in parts])
+    return RowLists(offsets_of(lengths), np.concatenate([part.rows for part in parts]))
 
 
 @inner_kernel

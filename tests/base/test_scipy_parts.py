@@ -9,7 +9,16 @@ from sfm_shapefit.laplacian import superlu
 from tests.program import run_python
 
 SCIPY = {"scipy.special", "scipy.linalg", "scipy.sparse", "scipy.spatial"}
+OURS = (
+    "rotations.average",
+    "placement.diagnosis",
+    "adjustment.iterative_factor",
+    "files.colmap.priors",
+    "files.nerf",
+    "files.opensfm",
+)
 HEAVY = SCIPY | {"pydantic", "rich", "cvxpy", "multiprocessing.connection"}
+HEAVY |= {f"sfm_shapefit.{name}" for name in OURS}
 LOCATE = ["locate", "data_synthetic/courtyard/sparse/0", "{out}", "--quiet", "--threads", "1"]
 
 

@@ -15,11 +15,12 @@ from itertools import pairwise
 import pycolmap
 import pytest
 
-from sfm_shapefit import locate
+from sfm_shapefit import check, locate, map_database
 from sfm_shapefit.base.display import Row, Telling
 from sfm_shapefit.base.kernel_cache import counted_as_compiling, measure_compilation
 from sfm_shapefit.cli import console
 from sfm_shapefit.cli.flags import OutputFlags
+from sfm_shapefit.cli.forecast import PLANS, Course
 from sfm_shapefit.cli.frame import Run
 from sfm_shapefit.files.colmap import model
 from sfm_shapefit.files.colmap.quiet import quiet_log
@@ -75,15 +76,83 @@ def test_tracks_of_a_model_are_counted_by_pairs_and_the_solve_by_iterations():
 RUN = """
 import time
 from sfm_shapefit.cli.progress import show_progress
-with show_progress(True, {how}) as hear:
-    hear("solve", 0, 1)
+with show_progress(True, {how}plan=("read", "directions", "trust")) as hear:
+    hear("directions", 0, 1)
     for k in range(1, 9):
-        hear("solve", k, 100)
+        hear("directions", k, 100)
         time.sleep({pause})
-    hear("solve", 1, 1)
+    hear("directions", 1, 1)
     hear("trust", 0, 1)
     hear("trust", 1, 1)
 """
+
+
+def test_the_rest_of_a_run_is_what_is_planned_at_the_rate_so_far():
+    """Twice as slow as usual, which is .02 s and .1 s for each 1,000 pairs of `directions`, and so on."""
+    course = Course(("read", "directions", "solve", "write"))
+    course.hear("read", 0, 1, now=0.0)
+    course.hear("directions", 0, 1, now=50.0)
+    assert course.rest(50.0) is None  # nobody knows how many pairs there are
+    course.hear("directions", 0, 100_000, now=50.0)
+    for done in (25_000, 50_000):
+        course.hear("directions", done, 100_000, now=50.0 + 2.0 * 10.02 * done / 100_000)
+    assert course.title == "2 of 4 directions"
+    assert course.counts == "50,000 of 100,000"
+    rest = 2.0 * (0.5 * 10.02 + 0.2 + 10.0 + 0.15 + 10.0)
+    assert course.rest(60.02) == pytest.approx(rest, rel=1e-9)
+    assert course.rest(62.02) == pytest.approx(rest - 2.0, rel=1e-9)  # a clock goes on between two reports
+    course.hear("directions", 1, 1, now=70.04)
+    course.hear("solve", 0, 1, now=70.04)
+    course.hear("solve", 1, 100, now=71.04)  # steps that it may take, not steps that it will
+    assert course.counts == ""
+    assert course.rest(72.04) == pytest.approx(2.0 * (10.2 + 10.15) - 2.0, rel=1e-9)
+    assert course.rest(95.0) is None  # it takes longer than usual
+
+
+def test_what_nobody_knows_of_a_run_is_not_forecast():
+    course = Course(("images", "features", "directions", "trust"))
+    course.hear("features", 0, 10, now=0.0)
+    course.hear("features", 5, 10, now=20.0)
+    assert course.rest(20.0) is None
+    assert course.rest_of_stage(20.0) == pytest.approx(20.0)
+    course.hear("directions", 0, 1000, now=40.0)
+    course.hear("directions", 400, 1000, now=48.0)
+    course.hear("directions", 500, 1000, now=50.0)
+    assert course.rest(50.0) == pytest.approx(10.0 + 20.0 * (0.1 + 0.15) / 0.12)
+    course.hear("features", 1, 1, now=50.0)  # the end of a stage around this one
+    assert course.title == "3 of 4 directions"
+    course.hear("compiling", 0, 1, now=50.0)
+    assert course.title == "compiling"
+    assert course.rest(50.0) is None
+    course.hear("directions", 500, 1000, now=90.0)  # resumed: what was done before has no rate
+    assert course.rest_of_stage(90.0) is None
+    assert course.rest(90.0) == pytest.approx(10.0 / 0.06 * (0.06 + 0.25))
+    course.hear("directions", 600, 1000, now=92.0)
+    assert course.rest_of_stage(92.0) == pytest.approx(8.0)
+    course.hear("features", 0, 1, now=92.0)  # once more
+    course.hear("directions", 0, 1000, now=92.0)
+    course.hear("directions", 500, 1000, now=97.0)
+    assert course.rest(97.0) is None
+
+
+@pytest.mark.parametrize(
+    ("plan", "run"),
+    [
+        ("MODEL OUT", lambda progress: locate(RING / "sparse/0", progress=progress)),
+        ("DATABASE OUT", lambda progress: map_database(RING / "database.db", progress=progress)),
+        ("MODEL with a database", lambda progress: check(RING / "sparse/0", progress=progress)),
+    ],
+)
+def test_a_run_keeps_to_its_plan(plan, run):
+    course = Course(PLANS[plan])
+
+    def hear(stage, done, total):
+        course.hear(stage, done, total, now=0.0)
+        assert course.stage in course.plan
+
+    run(hear)
+    assert course.is_as_planned
+    assert course.size
 
 
 def shown_on_a_terminal(code: str, **environment: str) -> list[str]:
@@ -108,16 +177,18 @@ def test_a_terminal_has_one_line_of_progress_with_what_is_left_and_nothing_of_it
     assert not any("\n" in one.strip() for one in plain)  # never more than one line
     assert all(len(one.strip()) <= int(environment.get("COLUMNS", 80)) for one in plain)
     if "COLUMNS" not in environment:
-        assert any(re.match(r"solve .* \d of 100, about \d+ s left \(\d s so far\)", one) for one in plain)
+        assert any(
+            re.match(r"2 of 3 directions .* \d of 100, \d s, about \d+ (s|min) left", one) for one in plain
+        )
     assert ("\x1b[9" in "".join(drawn)) == ("NO_COLOR" not in environment)
     assert drawn[-1].endswith("\x1b[2K")  # the line is erased
 
 
-@pytest.mark.parametrize("how", ["verbose=True", "patience_s=0.0"])
+@pytest.mark.parametrize("how", ["verbose=True, ", "patience_s=0.0, "])
 def test_without_a_terminal_a_short_run_says_nothing_and_a_long_one_a_line_for_each_stage(how):
     assert run_python("-c", RUN.format(how="", pause=0.0)).stderr == ""
     told = run_python("-c", RUN.format(how=how, pause=0.0)).stderr.splitlines()
-    assert told == ["sfm-shapefit: solve", "sfm-shapefit: trust"]
+    assert told == ["sfm-shapefit: 2 of 3 directions", "sfm-shapefit: 3 of 3 trust"]
 
 
 @pytest.mark.parametrize("verbose", [False, True])
@@ -139,7 +210,7 @@ def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, capfd
         assert "bundle adjustment" not in done.stdout
         return
     assert "these images are of the past" in native
-    assert "sfm-shapefit: directions\n" in done.stderr
+    assert "sfm-shapefit: 2 of 10 directions\n" in done.stderr
     assert re.search(r"seconds +│ read \d+\.\d\d, directions", done.stdout)
     assert "bundle adjustment" in done.stdout
 

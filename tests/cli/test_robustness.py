@@ -48,7 +48,7 @@ def test_a_model_without_a_usable_direction_gets_a_verdict_and_a_page(tmp_path, 
 def test_the_database_of_another_scene_gets_a_verdict():
     said = run("check", RING / "sparse/0", "--database", COURTYARD / "database.db", code=0).stdout
     assert "verdict: do not use" in said
-    assert "courtyard/database.db; no pair says where cameras stand\n" in said
+    assert "courtyard/database.db; no pair determines where cameras are\n" in said
     assert "contradict it and none agrees: is this the model's database?\n" in said
     assert "second opinion: 8 cameras have nothing in common with where they stand" in said
 

@@ -76,7 +76,7 @@ def test_many_cameras_are_told_in_one_sentence():
     assert line == (
         "3 of 5 cameras in doubt have another focal length now, by +10.0% to +30.0% (median +20.0%), most "
         "that of camera 3 (3.jpg and 3 more); 1 kept the given one, as the matches do not determine it; 1 "
-        "were not to be changed; each stands in locate.json"
+        "were not to be changed; locate.json has each"
     )
 
 
@@ -121,7 +121,7 @@ def test_cameras_whose_focal_length_is_hardly_known_are_named():
     rows = [row(1, sigma=10.0), row(2, sigma=12.0), row(3, sigma=None), row(4, "view graph", sigma=None)]
     (warning,) = intrinsics_warnings(rows)
     assert warning.startswith(
-        "the matches hardly tell the focal length of camera 2 (2.jpg and 3 more), camera 3 (3.jpg and 3 "
+        "the matches hardly determine the focal length of camera 2 (2.jpg and 3 more), camera 3 (3.jpg and 3 "
         "more) (± 1% or more), so"
     )
     assert list(intrinsics_warnings([*rows[:1], replace(rows[1], origin="given")])) == []

@@ -258,27 +258,27 @@ NAN, INF = float("nan"), float("inf")
 BROKEN_RECORDS = {
     "unknown camera model": (_set("cameras", 0, 1, 99), "camera 1 has the unknown camera model 99"),
     "NaN parameter": (_set("cameras", 0, 4, [NAN, 1.0, 1.0, 1.0]), "camera 1 has a parameter that is not"),
-    "camera twice": (_append("cameras", [1, 0, 9, 9, [1.0, 1.0, 1.0]]), "camera 1 stands twice"),
+    "camera twice": (_append("cameras", [1, 0, 9, 9, [1.0, 1.0, 1.0]]), "camera 1 appears twice"),
     "NaN pose": (_set("images", 1, 1, (1.0, NAN, 0, 0, 0, 0, 0)), "image 2 has a pose that is not finite"),
     "zero rotation": (_set("images", 1, 1, (0.0,) * 7), "image 2 has a rotation quaternion of norm 0 "),
     "long rotation": (_set("images", 1, 1, (2.0, *(0.0,) * 6)), "image 2 has a rotation .* of norm 2 "),
     "no camera": (_set("images", 1, 2, 5), "image 2 refers to camera 5"),
     "no name": (_set("images", 1, 3, b""), "image 2 has no name"),
-    "name twice": (_set("images", 1, 3, b"a.jpg"), r"image 2 \(a.jpg\) stands twice"),
-    "image twice": (_set("images", 1, 0, 1), r"image 1 \(b.jpg\) stands twice"),
+    "name twice": (_set("images", 1, 3, b"a.jpg"), r"image 2 \(a.jpg\) appears twice"),
+    "image twice": (_set("images", 1, 0, 1), r"image 1 \(b.jpg\) appears twice"),
     "NaN pixel": (_set("images", 1, 4, [(5.0, NAN, 7)]), "image 2 has a point whose coordinates are not"),
     "NaN point": (_set("points3D", 0, 1, (0.0, NAN, 1.0)), "3D point 7 has coordinates that are not finite"),
     "infinite point": (_set("points3D", 0, 1, (-INF, 0.0, 1.0)), "3D point 7 has coordinates that are not"),
-    "point twice": (_append("points3D", [7, (0.0, 0.0, 1.0), []]), "3D point 7 stands twice"),
+    "point twice": (_append("points3D", [7, (0.0, 0.0, 1.0), []]), "3D point 7 appears twice"),
     "rig of no camera": (_set("rigs", 0, 1, [(0, 4)]), "rig 1 refers to camera 4"),
-    "rig twice": (_append("rigs", [1, [(0, 1)]]), "rig 1 stands twice"),
-    "sensor twice": (_set("rigs", 0, 1, [(0, 1), (0, 1)]), "rig 1 has a sensor that stands twice"),
-    "frame twice": (_set("frames", 1, 0, 1), "frame 1 stands twice"),
+    "rig twice": (_append("rigs", [1, [(0, 1)]]), "rig 1 appears twice"),
+    "sensor twice": (_set("rigs", 0, 1, [(0, 1), (0, 1)]), "rig 1 has a sensor that appears twice"),
+    "frame twice": (_set("frames", 1, 0, 1), "frame 1 appears twice"),
     "frame of no rig": (_set("frames", 1, 1, 6), "frame 2 refers to rig 6"),
     "NaN frame": (_set("frames", 1, 2, (1.0, 0, 0, 0, 0, 0, INF)), "frame 2 has a pose that is not finite"),
     "frame of no sensor": (_set("frames", 1, 3, [(0, 3, 2)]), "frame 2 refers to sensor 3"),
     "frame of no image": (_set("frames", 1, 3, [(0, 1, 2), (0, 1, 5)]), "a frame refers to image 5"),
-    "image in two frames": (_set("frames", 1, 3, [(0, 1, 2), (0, 1, 1)]), "image 1 stands in two frames"),
+    "image in two frames": (_set("frames", 1, 3, [(0, 1, 2), (0, 1, 1)]), "image 1 is in two frames"),
     "image in no frame": (_set("frames", 1, 3, []), "image 2 of images.bin is in no frame"),
 }
 
@@ -339,7 +339,7 @@ BROKEN_LINES = {
     ),
     "not a number": ("images", "2 1 0 0 0 0", "2 1 0 0 0 x", r"images.txt:3: the pose holds something"),
     "zero rotation": ("images", "2 1 0", "2 0 0", r"images.txt: image 2 has a rotation .* of norm 0"),
-    "name twice": ("images", "b.jpg", "a.jpg", r"images.txt: image 2 \(a.jpg\) stands twice"),
+    "name twice": ("images", "b.jpg", "a.jpg", r"images.txt: image 2 \(a.jpg\) appears twice"),
     "line missing": ("images", "5 6 7\n", "", r"images.txt:3: the line of its points is missing"),
     "no triples": ("images", "5 6 7", "5 6", r"images.txt:4: expected triples"),
     "NaN pixel": ("images", "5 6 7", "nan 6 7", r"images.txt: image 2 has a point whose coordinates are"),
@@ -349,7 +349,7 @@ BROKEN_LINES = {
     "large number": ("images", "2 1 0", f"{2**32} 1 0", r"images.txt:3: a number is out of its range"),
     "huge number": ("cameras", "640", "9" * 5000, r"cameras.txt:2: the camera holds .* not a whole number"),
     "unknown camera": ("images", "1 b.jpg", "4 b.jpg", r"images.txt: image 2 refers to camera 4, which cam"),
-    "image twice": ("images", "2 1 0", "1 1 0", r"images.txt: image 1 \(b.jpg\) stands twice"),
+    "image twice": ("images", "2 1 0", "1 1 0", r"images.txt: image 1 \(b.jpg\) appears twice"),
 }
 
 
@@ -515,7 +515,7 @@ def brute_force_tracks(scene: pycolmap.Reconstruction) -> dict[tuple[int, int], 
 
 
 def as_sets(batches) -> dict[tuple[int, int], set[tuple[int, int]]]:
-    """Matches of batches by pair; checks that no match and no pair stands twice."""
+    """Matches of batches by pair; checks that no match and no pair appears twice."""
     found = {}
     for batch in batches:
         assert batch.offsets[0] == 0

@@ -16,8 +16,8 @@ DAMAGED = [
     ("UPDATE cameras SET params = x'00'", "camera 1 of the database has 0 parameters, where PINHOLE has 4"),
     ("UPDATE cameras SET model = 99", "has the model 99, which pycolmap does not know"),
     ("UPDATE cameras SET camera_id = 4294967295", "camera with id 4294967295 is damaged"),
-    (UNTYPED.format("cameras") + "INSERT INTO cameras SELECT * FROM cameras", "camera 1 stands twice"),
-    (UNTYPED.format("images") + "INSERT INTO images SELECT * FROM images", "id 1 stands twice"),
+    (UNTYPED.format("cameras") + "INSERT INTO cameras SELECT * FROM cameras", "camera 1 appears twice"),
+    (UNTYPED.format("images") + "INSERT INTO images SELECT * FROM images", "id 1 appears twice"),
     (UNTYPED.format("images") + "UPDATE images SET camera_id = 'x'", "has 'x' for the number camera_id"),
     (UNTYPED.format("cameras") + "UPDATE cameras SET width = 'x'", "has 'x' for the number width"),
     (
@@ -34,9 +34,9 @@ DAMAGED_RIGS = [
     ("UPDATE rig_sensors SET sensor_from_rig = x'00'", "the pose of a sensor in rig 1 is damaged"),
     ("UPDATE rig_sensors SET sensor_id = 99 WHERE sensor_id = 3", "rig 1 refers to camera 99"),
     ("UPDATE rigs SET ref_sensor_id = 77 WHERE rig_id = 1", "rig 1 refers to camera 77"),
-    ("UPDATE rigs SET ref_sensor_id = 2 WHERE rig_id = 1", "camera 2 stands twice in rig 1"),
+    ("UPDATE rigs SET ref_sensor_id = 2 WHERE rig_id = 1", "camera 2 appears twice in rig 1"),
     ("UPDATE frame_data SET sensor_id = 3 WHERE data_id = 2", "frame 1 has image 2 at another camera"),
-    ("UPDATE frame_data SET frame_id = 1", "an image of frame 1 stands twice"),
+    ("UPDATE frame_data SET frame_id = 1", "an image of frame 1 appears twice"),
 ]
 
 

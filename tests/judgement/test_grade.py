@@ -170,8 +170,8 @@ def test_evidence_that_the_fit_did_not_use_names_cameras_and_lowers_the_grade(fo
 def test_a_loose_group_stands_apart_and_an_unchecked_one_is_looked_at(found):
     names = found.images.names
     for is_loose, grade, reason in (
-        (True, Grade.DO_NOT_USE, "nothing says how 2 of 8 cameras stand to the rest"),
-        (False, Grade.LOOK, "nothing checks how groups of cameras stand to one another"),
+        (True, Grade.DO_NOT_USE, "nothing says where 2 of 8 cameras are relative to the rest"),
+        (False, Grade.LOOK, "nothing checks where groups of cameras are relative to one another"),
     ):
         group = untied_group(*names[1:3], is_loose=is_loose)
         verdict = replace(found, evidence=ModelEvidence(untied=(group,))).verdict

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.facts.warnings import match_warnings, quality_warnings, support_warnings, trust_warnings
+from sfm_shapefit.facts.located_warnings import located_warnings
+from sfm_shapefit.facts.warnings import match_warnings, quality_warnings, support_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
@@ -51,14 +52,9 @@ def second_configuration(found):
     return replace(found, placement=placement), quality_warnings(placement)
 
 
-def left_out(found):
-    kept = np.arange(8) != 3
-    return replace(found, kept=kept), trust_warnings(found.placement, kept)
-
-
 def unsupported(found):
     told = replace(found, unsupported=np.arange(8) == 3)
-    return told, support_warnings([found.images.names[3]], is_kept=True)
+    return told, support_warnings([found.images.names[3]])
 
 
 def twofold(found, status=DirectionStatus.TWO_MOTIONS):
@@ -71,7 +67,7 @@ def contradicting_rotations(found):
     return twofold(found, DirectionStatus.LOW_INLIER_RATIO)
 
 
-DOUBTS = (uncertain, second_configuration, left_out, unsupported, twofold, contradicting_rotations)
+DOUBTS = (uncertain, second_configuration, unsupported, twofold, contradicting_rotations)
 
 
 @pytest.mark.parametrize("doubt", DOUBTS)
@@ -79,6 +75,14 @@ def test_a_warning_that_doubts_a_model_stands_over_no_good_one(ring_located, dou
     told, warnings = doubt(ring_located)
     assert list(warnings)
     assert told.verdict.grade is not Grade.GOOD
+
+
+def test_an_image_that_is_left_out_is_named_where_it_is_listed_and_in_no_warning(ring_located):
+    told = replace(ring_located, kept=np.arange(8) != 3)
+    rows = {one.label: list(one.lines) for one in told.told.rows}
+    assert rows["not trusted"] == ["1 image of these; min_trust=0 keeps it"]
+    assert told.verdict.cameras == (told.images.names[3],)
+    assert not any(told.images.names[3] in warning for warning in located_warnings(told, ()))
 
 
 def test_evidence_that_is_told_is_in_the_verdict_and_each_named_camera_has_its_reason(ring_located):

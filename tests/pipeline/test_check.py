@@ -53,7 +53,7 @@ def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path, ring_ma
     drawing, facts = found.drawing, found.facts
     assert facts.verdict.cameras == (name,)
     row = drawing.cameras.names.index(name)
-    assert "pairs contradict where it stands" in drawing.cameras.reasons[row]
+    assert "pairs contradict its place" in drawing.cameras.reasons[row]
     assert "its reprojection error is" in drawing.cameras.reasons[row]
     wrong = drawing.pairs.cameras[drawing.pairs.classes == PairClass.CONTRADICTS]
     assert len(wrong) > 0
@@ -92,7 +92,7 @@ def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_
     told = run("check", COURTYARD / "truth", "--database", COURTYARD / "database.db", code=0).stdout
     assert "verdict: good" in told
     assert "weak: " not in told  # one has many false pairs, but the second opinion has it at the same place
-    assert "second opinion: 25 cameras stand in the same place in the model that map made" in told
+    assert "second opinion: 25 cameras are in the same place in the model that map made" in told
     moved = pycolmap.Reconstruction(COURTYARD / "truth")
     image = moved.image(sorted(moved.reg_image_ids())[7])
     pose = image.frame.rig_from_world
@@ -115,7 +115,7 @@ def test_what_map_doubts_check_does_not_call_good():
         assert found.verdict.cameras == doubted
         assert found.facts.evidence.second.ambiguous == doubted
         assert (
-            "at least half as much speaks for another place or rotation"
+            "at least half as much evidence is for another place or rotation"
             in found.facts.evidence.second.statement
         )
         assert " workspace " in found.facts.next_step.command  # it would be placed there again

@@ -214,9 +214,7 @@ def test_an_empty_file_is_refused(ring, tmp_path):
 def test_points_that_cannot_be_triangulated_leave_the_model_as_it_is(ring, tmp_path):
     found = sfm_shapefit.locate(ring, RING / "database.db", control_points=written(tmp_path, TWICE))
     assert found.gauge.scale == "input"
-    assert any(
-        "the model does not stand in the axes of the control points" in said for said in found.warnings
-    )
+    assert any("the model is not in the axes of the control points" in said for said in found.warnings)
     assert {row["use"] for row in found.summary()["control_points"]} == {"unused"}
 
 

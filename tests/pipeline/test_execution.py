@@ -17,13 +17,13 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.pair_directions import concatenate
-from sfm_shapefit.pipeline.execution import DaskWorkers, measure_with_workers, workers_of
+from sfm_shapefit.pipeline.execution import DaskWorkers, measure_with_workers
 from tests.adjustment.made import disturb
 from tests.adjustment.test_iterative import make_wall
+from tests.clusters import client_of
 from tests.program import run, run_refused
 from tests.scenes import COURTYARD, RING, view_of
 
-distributed = pytest.importorskip("distributed")
 RING_MODEL, RING_DATABASE = RING / "sparse" / "0", RING / "database.db"
 
 
@@ -88,7 +88,7 @@ def lack(_batch):
 def test_what_the_input_lacks_passes_as_it_is_and_what_a_worker_lacks_is_told(tiny_ring, model, dask_client):
     with pytest.raises(InputError, match="the database is damaged"):
         measured(tiny_ring, model, DaskWorkers(dask_client), refuse)
-    with pytest.raises(WorkerError, match=r"a worker failed \(no room\); look at its log"):
+    with pytest.raises(WorkerError, match=r"the workers failed \(no room\); look at their logs"):
         measured(tiny_ring, model, DaskWorkers(dask_client), lack)
 
 
@@ -102,10 +102,7 @@ def test_an_adjustment_in_parts_is_the_same_for_any_number_of_workers_one_of_whi
     start = disturb(make_wall((20, 30)), np.random.default_rng(1), center=0.01, rotation_rad=1e-3, point=0.01)
     steps = {"max_iterations": 2, "settles_points": True}
     here = adjust(start, crew=Crew(1), **steps)
-    local = distributed.LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-    )
-    with local, distributed.Client(local, set_as_default=False) as client:
+    with client_of(workers) as client:
         cluster = Counting(DaskWorkers(client), leaves_at)
         there = adjust(start, crew=Crew(2, cluster), **steps)
         assert len(client.scheduler_info()["workers"]) == workers - (leaves_at >= 0)
@@ -117,10 +114,7 @@ def test_an_adjustment_in_parts_is_the_same_for_any_number_of_workers_one_of_whi
 @pytest.mark.slow
 def test_a_process_that_is_killed_is_replaced(tiny_ring, model, tmp_path):
     flag, alone = tmp_path / "killed", ESTIMATE
-    with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as local,
-        distributed.Client(local, set_as_default=False) as client,
-    ):
+    with client_of(2, processes=True) as client:
         found, _ = measured(tiny_ring, model, DaskWorkers(client), partial(die_once, str(flag)))
     assert flag.exists()
     with view_of(tiny_ring / "database.db", model.images) as view:
@@ -170,26 +164,43 @@ def test_no_scheduler_at_an_address_is_told_in_a_sentence(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_scheduler_that_is_gone_is_told(tiny_ring, model):
+    with client_of(1) as client:
+        client.close()
+        with pytest.raises(WorkerError, match=r"the workers failed \(Client is closed.* look at their logs"):
+            measured(tiny_ring, model, DaskWorkers(client))
+
+
 def test_a_scheduler_without_workers_is_told():
     with (
-        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as local,
-        distributed.Client(local, set_as_default=False) as client,
+        client_of(0) as client,
         pytest.raises(WorkerError, match="has no worker; start one"),
     ):
         sfm_shapefit.map_database(COURTYARD / "database.db", client=client)
 
 
 class Elsewhere:
-    """A client whose workers are on another machine, where a file is another one."""
+    """A client one of whose workers is on a machine where something is otherwise."""
 
-    def run(self, look, path):
-        here = look(path)
-        return {"tcp://a": here, "tcp://b": here._replace(size=here.size + 1)}
+    def __init__(self, change):
+        self.change = change
+
+    def run(self, look, path, **_options):
+        return {"tcp://a": look(path), "tcp://b": self.change(look(path))}
 
 
-def test_a_worker_that_does_not_see_the_database_is_named():
-    with pytest.raises(WorkerError, match=r"1 worker of 2, tcp://b the first, does not see .*database.db"):
-        workers_of(Elsewhere(), RING_DATABASE)
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda seen: seen._replace(size=seen.size + 1), "does not see .*database.db as it is here; share"),
+        (lambda seen: seen._replace(modified_ns=0), "does not see .*database.db as it is here; share"),
+        (lambda seen: seen._replace(version="0"), "has sfm_shapefit 0; install version"),
+        (lambda _seen: ModuleNotFoundError("sfm_shapefit"), "has no sfm_shapefit; install version"),
+    ],
+)
+def test_a_worker_that_lacks_the_database_or_the_package_is_named_before_anything_is_measured(change, words):
+    with pytest.raises(WorkerError, match=f"the worker tcp://b {words}"):
+        sfm_shapefit.locate(RING_MODEL, RING_DATABASE, client=Elsewhere(change))
 
 
 def test_the_option_before_is_answered(tmp_path):

@@ -33,7 +33,7 @@ UNUSABLE = {
     ),
     "another scene": (("UPDATE images SET name = 'other_' || name",), "has 0 of the model's 8 images"),
     "text as width": ((*UNTYPED, "UPDATE cameras SET width = 'x'"), "has 'x' for the number width"),
-    "a camera twice": ((*UNTYPED, "INSERT INTO cameras SELECT * FROM cameras"), "camera 1 stands twice"),
+    "a camera twice": ((*UNTYPED, "INSERT INTO cameras SELECT * FROM cameras"), "camera 1 appears twice"),
     "no such keypoints": (
         ("UPDATE keypoints SET rows = 3, data = substr(data, 1, 12 * cols)",),
         "has matches of keypoints that do not exist",

@@ -367,7 +367,7 @@ def test_components_become_models_of_their_own_and_single_images_are_named(tmp_p
     others = {row.name for row in found.cameras if not row.placed} - set(found.models[0].not_placed)
     assert others <= {row.name for row in found.models[1].cameras if row.placed}
     assert found.models[0].verdict.statement == "good"
-    assert found.verdict.statement == "look: 43% of the images stand in another model"
+    assert found.verdict.statement == "look: 43% of the images are in another model"
     sfm_shapefit.write_result(found, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
 
@@ -456,7 +456,7 @@ def test_a_second_rigid_piece_is_a_model_and_what_keeps_it_apart_is_told(tmp_pat
     # The images of the other are not missing in either, but not there: neither is all of the scene.
     verdicts = [model.verdict for model in found.models]
     assert [verdict.grade for verdict in verdicts] == ["look", "look"]
-    assert all("of the images stand in another model" in verdict.reasons[-1] for verdict in verdicts)
+    assert all("of the images are in another model" in verdict.reasons[-1] for verdict in verdicts)
     (told,) = found.joins
     assert "1 pair of images cannot tell how large it is and where" in told.reason
     sfm_shapefit.write_result(found, tmp_path / "out")

@@ -464,7 +464,7 @@ def test_models_with_rigs_are_joined_at_the_scale_that_they_have(rigs, workspace
     pieces = [ModelPiece(label=f"model {k}", model=read_model(part)) for k, part in enumerate(parts)]
     with closing(open_database(workspace / "database.db", read_model(whole).images.names)) as matches:
         (told,) = judge_joins(pieces, tie_pieces(pieces, matches, frozenset()))
-    assert told.statement == "model 1 is not joined to model 0: their rigs do not tell the scale of both"
+    assert told.statement == "model 1 is not joined to model 0: their rigs do not give the scale of both"
     alone = pycolmap.Reconstruction(RING / "sparse" / "0")
     with pytest.raises(
         InputError, match="model 1 has rigs of several cameras, and a scale by that, but model 0"

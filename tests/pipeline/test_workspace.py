@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg
-from tests.program import run
+from sfm_shapefit.files.undistortion_options import UndistortionOptions
+from tests.program import run, run_refused
 
 SKY_DISTANCE = 20.0
 LENSES = {
@@ -143,6 +144,64 @@ def test_pictures_show_what_their_cameras_see(tmp_path, lens):
     medians, most = zip(*(off_the_sky(*view) for view in views), strict=True)
     assert max(medians) <= 1.0
     assert max(most) <= 2.5
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "radial", "panorama"])
+def test_pictures_are_made_smaller_where_that_is_wanted(tmp_path, lens):
+    sky = draw_sky(tmp_path, [lens], num_frames=2)
+    sfm_shapefit.workspace(sky.model, sky.images, tmp_path / "out", level="never", max_image_size=61)
+    views = list(read_as_3dgs(tmp_path / "out"))
+    assert {max(picture.shape[:2]) for picture, *_ in views} == {61}
+    # As above; the mean over a smaller pixel differs from its middle by less than a level.
+    assert max(np.median(off_the_sky(*view)) for view in views) <= 1.5
+    model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
+    assert max(point.error for point in model.points3D.values()) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("lens", "longest_px"), [("pinhole", -1), ("radial", -1), ("fisheye", 80), ("panorama", -1)]
+)
+def test_masks_go_the_way_of_their_pictures(tmp_path, lens, longest_px):
+    """Masked is the half of the sky that is less green, but in the first image, which has no mask."""
+    sky = draw_sky(tmp_path, [lens, lens], num_frames=2)
+    for name in ("cam0/1.png", "cam1/0.png", "cam1/1.png"):
+        picture = cv2.imread(str(sky.images / name))
+        file = tmp_path / f"masks/{name}.png" if name != "cam1/1.png" else tmp_path / "masks" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), (picture[..., 1] > 127).astype(np.uint8))  # to COLMAP, 1 is as good as 255
+    out, options = tmp_path / "out", {"mask_path": str(tmp_path / "masks"), "max_image_size": longest_px}
+    sfm_shapefit.workspace(sky.model, sky.images, out, options=UndistortionOptions(**options))
+    frames = json.loads((out / "transforms.json").read_text())["frames"]
+    assert {path.name for path in (out / "masks").iterdir()} == {
+        f"{path.name}.png" for path in (out / "images").iterdir()
+    }
+    assert len(frames) == 4 * FACES.get(lens, 1)  # nerfstudio wants a mask of each or of none
+    for frame in frames:
+        assert frame["mask_path"] == f"masks/{Path(frame['file_path']).name}.png"
+        mask = cv2.imread(str(out / frame["mask_path"]), cv2.IMREAD_UNCHANGED)
+        picture = cv2.imread(str(out / frame["file_path"]))
+        assert mask.shape == picture.shape[:2]
+        assert set(np.unique(mask)) <= {0, 255}
+        is_first = Path(frame["file_path"]).name.startswith("cam0_0")
+        clear = np.abs(picture[..., 1] - 127.0) > 6.0  # farther from the edge of the mask than two pixels
+        wanted = np.ones_like(clear) if is_first else picture[..., 1] > 127
+        assert np.mean((mask > 0)[clear] == wanted[clear]) > 0.995  # the border of the picture aside
+
+
+def test_masks_that_are_none_or_of_another_size_are_told(tmp_path):
+    sky, masks = draw_sky(tmp_path, ["pinhole"]), tmp_path / "masks"
+    masks.mkdir()
+    sky.model.write(tmp_path / "images")
+    typed = ("workspace", tmp_path / "images", sky.images, tmp_path / "out", "--mask_path", masks)
+    assert "has no mask of the 4 images; that of 0.png is to be 0.png.png" in run_refused(*typed)
+    cv2.imwrite(str(masks / "0.png"), np.zeros((120, 160), np.uint8))
+    cv2.imwrite(str(masks / "1.png.png"), np.zeros((60, 80), np.uint8))
+    (masks / "2.png").write_text("no picture")
+    said = run(*typed, code=0).stdout
+    assert "1 image is left out (mask of another size than its camera's): 1.png" in said
+    assert "1 image is left out (unreadable mask): 2.png" in said
+    assert not cv2.imread(str(tmp_path / "out/masks/0.png.png")).any()
+    assert cv2.imread(str(tmp_path / "out/masks/3.png.png")).all()
 
 
 @pytest.mark.parametrize("lenses", [["panorama"], ["circle"], ["circle", "circle"], ["radial", "fisheye"]])

@@ -366,7 +366,7 @@ def test_a_table_is_read_by_name_with_either_separator_deviations_and_latitudes(
         ("0003.jpg 1 2 1e308", "line 2: coordinates must be finite .* below 1e"),
         ("0003.jpg 1 2 3 1e-200", "line 2: coordinates must be finite and standard deviations positive"),
         ("0003.jpg 1 2 3 -1", "line 2: coordinates must be finite and standard deviations positive"),
-        ("0001.jpg 1 2 3", "line 2: 0001.jpg stands twice"),
+        ("0001.jpg 1 2 3", "line 2: 0001.jpg appears twice"),
     ],
 )
 def test_a_malformed_line_of_a_table_is_named(ring, tmp_path, line, message):

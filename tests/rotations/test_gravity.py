@@ -146,7 +146,7 @@ def test_the_gravity_of_pose_priors_is_read(tmp_path):
         ("0001.jpg 0 nan 0", "line 1: the direction must be finite"),
         ("0001.jpg 0 1 0 -2", "the standard deviation between 0.001 and 90 deg"),
         ("0001.jpg 0 1 0 1e-100", "the standard deviation between 0.001 and 90 deg"),
-        ("0001.jpg 0 1 0\n0001.jpg 0 1 0", "line 2: 0001.jpg stands twice; keep one of its lines"),
+        ("0001.jpg 0 1 0\n0001.jpg 0 1 0", "line 2: 0001.jpg appears twice; keep one of its lines"),
         ("other.jpg 0 1 0", "has no gravity of the model's images, such as 0001.jpg"),
     ],
 )

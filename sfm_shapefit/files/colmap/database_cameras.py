@@ -59,7 +59,7 @@ def read_cameras(file: DatabaseFile) -> DatabaseCameras:
     """Read the cameras of a database.
 
     Raises:
-        InputError: if an id is none or stands twice, or the database cannot be read.
+        InputError: if an id is none or appears twice, or the database cannot be read.
     """
     query = f"SELECT {', '.join(_COLUMNS)} FROM cameras ORDER BY 1"
     usable: dict[int, pycolmap.Camera] = {}
@@ -70,7 +70,7 @@ def read_cameras(file: DatabaseFile) -> DatabaseCameras:
                 f"{file.path}: the camera with id {camera_id!r} is damaged; extract features again"
             )
         if camera_id in usable or camera_id in impossible:
-            raise InputError(f"{file.path}: camera {camera_id} stands twice; remove one of them")
+            raise InputError(f"{file.path}: camera {camera_id} appears twice; remove one of them")
         try:
             camera, said = _camera(*row)
         except ValueError as error:

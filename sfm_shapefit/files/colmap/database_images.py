@@ -109,7 +109,7 @@ def read_images(file: DatabaseFile) -> UnposedImages:
                 f"{path}: the image with id {image_id!r} has no valid name and camera; it is damaged"
             )
         if image_id in camera_of:
-            raise InputError(f"{path}: the image with id {image_id} stands twice; remove one of them")
+            raise InputError(f"{path}: the image with id {image_id} appears twice; remove one of them")
         camera_of[image_id], names[image_id] = camera_id, name
     notes = list(cameras.notes(lost))
     if len(camera_of) < 2:

@@ -123,7 +123,7 @@ def match_names(file: DatabaseFile, names: Sequence[str]) -> dict[int, int]:
                 f"{path}: the image with id {image_id!r} has no valid id and name; it is damaged"
             )
         if index in matched or image_id in index_of_id:
-            raise InputError(f"{path}: the image {name} stands twice; remove one of them")
+            raise InputError(f"{path}: the image {name} appears twice; remove one of them")
         index_of_id[image_id] = index
         if index >= 0:
             matched.add(index)
@@ -169,7 +169,7 @@ def read_pairs(file: DatabaseFile, index_of_id: dict[int, int], damage: Damage) 
     elif len(wrong):
         row = int(wrong[0])
         reason = f"has the unknown configuration {configs[row]}" if is_there[row] else "is of no two images"
-        reason = reason if is_new[row] else "stands twice"
+        reason = reason if is_new[row] else "appears twice"
         first = f"{_called(file, int(pair_ids[row]))} {reason}"
     damage.leave_aside(len(broken) + len(wrong), len(broken) + len(rows), "pairs", first)
     swapped = ends[:, 0] > ends[:, 1]

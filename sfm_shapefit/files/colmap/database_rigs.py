@@ -73,7 +73,9 @@ def read_rigs(
         if rig_id not in rigs:
             rigs[rig_id] = RigRecord(rig_id, {(CAMERA_SENSOR, references[rig_id]): None})
         if (CAMERA_SENSOR, camera_id) in rigs[rig_id].sensors:
-            raise InputError(f"{path}: camera {camera_id} stands twice in rig {rig_id}; configure rigs again")
+            raise InputError(
+                f"{path}: camera {camera_id} appears twice in rig {rig_id}; configure rigs again"
+            )
         sensors_of_rig = {**rigs[rig_id].sensors, (CAMERA_SENSOR, camera_id): _pose(path, rig_id, pose)}
         rigs[rig_id] = RigRecord(rig_id, sensors_of_rig)
     places = _places(path, camera_of, rig_of_frame, data)
@@ -132,6 +134,6 @@ def _places(
     for frame_id, image_ids in members.items():
         cameras = [camera_of[i] for i in image_ids]
         if len(set(cameras)) < len(cameras) or any(i in frame_of for i in image_ids):
-            raise InputError(f"{path}: an image of frame {frame_id} stands twice; configure rigs again")
+            raise InputError(f"{path}: an image of frame {frame_id} appears twice; configure rigs again")
         frame_of |= {i: InFrame(rig_of_frame.get(frame_id, -1), min(image_ids)) for i in image_ids}
     return frame_of

@@ -41,7 +41,7 @@ def table_gravity(path: Path, images: Images) -> Gravity:
         if len(cells) not in (4, 5) or not all(map(is_number, cells[1:])):
             raise InputError(f"{where}expected {_FORM}")
         if cells[0] in rows:
-            raise InputError(f"{where}{cells[0]} stands twice; keep one of its lines")
+            raise InputError(f"{where}{cells[0]} appears twice; keep one of its lines")
         *direction, sigma = [*map(float, cells[1:]), _SIGMA_DEG][:4]
         length = float(np.linalg.norm(direction))
         if not 1.0 / _LARGEST <= length <= _LARGEST or not _LEAST_SIGMA_DEG <= sigma < 90.0:

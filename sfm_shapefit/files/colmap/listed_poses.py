@@ -21,18 +21,13 @@ from sfm_shapefit.files.colmap.intrinsics import find_uncalibrated
 from sfm_shapefit.files.colmap.lenses import camera_of, lens_of
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, read_model
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays
-from sfm_shapefit.files.colmap.other_programs import model_of_images, model_of_opensfm
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.files.json_node import read_json
 from sfm_shapefit.files.listed_names import find_images
-from sfm_shapefit.files.nerf import read_nerf
-from sfm_shapefit.files.opensfm import read_opensfm
-from sfm_shapefit.files.tum import read_tum
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.listed_poses import ListedPoses
 
-_READERS = {".json": read_nerf, ".txt": read_tum, ".tum": read_tum, ".csv": read_tum}
+_SUFFIXES = {".json", ".txt", ".tum", ".csv"}
 _UNKNOWN = Lens("SIMPLE_PINHOLE", (1.0, 0.0, 0.0))  # without a size
 _FOLDER = re.compile(r"^(\./)?(images/)?")
 """Where transforms.json has the images of COLMAP's workspaces."""
@@ -42,7 +37,7 @@ _SAME_SHAPE = 0.01  # relative difference of aspect ratios; pictures that are sh
 
 def is_list(source: object) -> bool:
     """Return whether a source of a model is a file of another program's, not a folder."""
-    is_named_so = isinstance(source, Path | str) and Path(source).suffix.lower() in _READERS
+    is_named_so = isinstance(source, Path | str) and Path(source).suffix.lower() in _SUFFIXES
     return is_named_so and not Path(str(source)).is_dir()
 
 
@@ -72,10 +67,14 @@ def read_by_itself(source: ModelSource, *, with_lenses: bool = False) -> ColmapM
     """
     if not (isinstance(source, Path | str) and is_list(source)):
         return read_model(source)
+    from sfm_shapefit.files.colmap.other_programs import model_of_images, model_of_opensfm
+    from sfm_shapefit.files.json_node import read_json
+    from sfm_shapefit.files.opensfm import read_opensfm
+
     file = Path(source)
     if file.suffix.lower() == ".json" and isinstance(read_json(file), list):
         return read_model(model_of_opensfm(read_opensfm(file)))
-    poses = _READERS[file.suffix.lower()](file)
+    poses = _read_poses(file)
     lenses = [lens or _UNKNOWN for lens in poses.lenses]
     if with_lenses and _UNKNOWN in lenses:
         name = poses.names[lenses.index(_UNKNOWN)]
@@ -90,6 +89,13 @@ def read_by_itself(source: ModelSource, *, with_lenses: bool = False) -> ColmapM
     return replace(read, notes=(*poses.notes, *read.notes))
 
 
+def _read_poses(file: Path) -> ListedPoses:
+    from sfm_shapefit.files.nerf import read_nerf  # here: few models are lists
+    from sfm_shapefit.files.tum import read_tum
+
+    return read_nerf(file) if file.suffix.lower() == ".json" else read_tum(file)
+
+
 def read_list(file: Path, database: Path | str | None) -> tuple[ModelArrays, frozenset[int], tuple[str, ...]]:
     """Return the images of a database with the poses of a list, ids of cameras as `read_source`, and notes.
 
@@ -100,7 +106,7 @@ def read_list(file: Path, database: Path | str | None) -> tuple[ModelArrays, fro
     """
     if not file.is_file():
         raise InputError(f"{file} does not exist; give a COLMAP folder, transforms.json or a trajectory")
-    poses = _READERS[file.suffix.lower()](file)
+    poses = _read_poses(file)
     if database is None:
         raise InputError(f"{file} has poses but no matches; give the database that has them (database=FILE)")
     with closing(DatabaseFile(database)) as opened:

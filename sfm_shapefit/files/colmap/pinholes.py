@@ -2,7 +2,7 @@
 
 A lens becomes one pinhole, or faces where it sees more than one holds: panoramas the six of a cube, fisheyes
 two or four that are turned aside and overlap in the middle. Principal points are in the middle of the
-pictures, since 3DGS takes them to be there. Faces of one picture are a rig.
+pictures, since 3DGS takes them to be there. Faces of one picture are a rig. Masks go the same way.
 """
 
 import itertools
@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.paths import file_of
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.lenses import lens_of, rays_of
-from sfm_shapefit.files.colmap.picture_colors import read_picture
+from sfm_shapefit.files.colmap.picture_colors import Rgb, read_picture
 from sfm_shapefit.files.colmap.points import points2d_of, points_of
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.files.colmap.reconstructions import add_point, arrays_of, bytes_of_name, name_of
@@ -49,6 +49,8 @@ _CUBE = {
 _SAME_PX = 1.0  # pixels off the middle; a principal point no farther off is there
 _WRITTEN = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}  # suffixes of pictures; others become .png
 _MAPS_AT_ONCE = 6  # tables of where pixels come from; each takes 8 bytes a pixel
+_MASK = ".png"  # behind the name of an image: that of its mask, as COLMAP and who trains splats have it
+_HALF = 128  # level up to 255; a pixel of a mask that was made smaller is what most of its parts are
 _JPEG_QUALITY = 95  # percent, JPEG's own scale; blocks are not seen
 
 Maps = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
@@ -63,7 +65,27 @@ class Pinhole(NamedTuple):
     turn: FloatArray
     """(3, 3) from axes of the lens to its own."""
     is_same: bool = False
-    """Whether pictures stay as they are."""
+    """Whether pixels stay where they are."""
+    full_size: tuple[int, int] = (0, 0)
+    """Width and height before the picture was made smaller; zeros if it was not."""
+
+    def within(self, longest_px: int) -> "Pinhole":
+        """Return the same with a picture whose longer side has at most so many pixels; -1 for any number."""
+        size = self.camera.width, self.camera.height
+        if longest_px < 0 or max(size) <= longest_px:
+            return self
+        small = pycolmap.Camera(self.camera.todict())
+        small.rescale(longest_px / max(size))
+        return self._replace(camera=small, full_size=size)
+
+    @property
+    def full(self) -> pycolmap.Camera:
+        """The camera before the picture was made smaller."""
+        if not any(self.full_size):
+            return self.camera
+        full = pycolmap.Camera(self.camera.todict())
+        full.rescale(*self.full_size)
+        return full
 
     def project(self, rays: FloatArray) -> FloatArray:
         """Return the pixels (k, 2) of rays (k, 3) in axes of the lens; NaN beyond the picture."""
@@ -74,8 +96,12 @@ class Pinhole(NamedTuple):
         return xy
 
 
-def pinholes_of(camera: pycolmap.Camera) -> list[Pinhole]:
-    """Return what pictures through a lens become."""
+def pinholes_of(camera: pycolmap.Camera, longest_px: int = -1) -> list[Pinhole]:
+    """Return what pictures through a lens become, with longer sides of at most so many pixels, -1 for any."""
+    return [pinhole.within(longest_px) for pinhole in _pinholes_of(camera)]
+
+
+def _pinholes_of(camera: pycolmap.Camera) -> list[Pinhole]:
     lens = lens_of(camera)
     if lens.is_panorama:
         size = 2 * round(lens.focal_px)  # as fine in the middle as the panorama is
@@ -133,7 +159,8 @@ def _face(size: int, shape: FloatArray, yaw: float, pitch: float) -> tuple[pycol
 
 
 def _maps_of(camera: pycolmap.Camera, pinhole: Pinhole) -> Maps:
-    """Return where the pixels of a picture come from, as OpenCV counts them."""
+    """Return where the pixels of a picture, before it is made smaller, come from, as OpenCV counts them."""
+    pinhole = pinhole._replace(camera=pinhole.full)
     width, height = pinhole.camera.width, pinhole.camera.height
     maps = np.empty((height, width, 2), dtype=np.float32)
     for y in range(height):  # all at once would take ten times the memory
@@ -169,10 +196,15 @@ class Flat(NamedTuple):
     """Names of the pictures, one for each pinhole."""
 
 
-def flats_of(model: pycolmap.Reconstruction, folder: Path) -> tuple[list[Flat], list[str]]:
-    """Return what posed images with a picture in a folder become, by name, and the names of the others."""
+def flats_of(
+    model: pycolmap.Reconstruction, folder: Path, longest_px: int = -1
+) -> tuple[list[Flat], list[str]]:
+    """Return what posed images with a picture in a folder become, by name, and the names of the others.
+
+    Longer sides of pictures have so many pixels at most, -1 for any number.
+    """
     flats, others, taken = list[Flat](), list[str](), set[str]()
-    pinholes = cache(lambda camera_id: pinholes_of(model.camera(camera_id)))
+    pinholes = cache(lambda camera_id: pinholes_of(model.camera(camera_id), longest_px))
     for name, image_id in sorted((name_of(model.image(i)), i) for i in model.reg_image_ids()):
         image, file = model.image(image_id), file_of(folder, name)
         if file is None:
@@ -194,8 +226,20 @@ def _names(name: str, pinholes: Sequence[Pinhole], taken: set[str]) -> list[str]
     return names
 
 
-def write_flats(flats: Sequence[Flat], folder: Path, threads: int) -> Iterator[str]:
+def mask_of(masks: Path, name: str) -> Path | None:
+    """Return the mask of an image as COLMAP looks for it; None if it has none."""
+    own = name if name.lower().endswith(".png") else ""
+    return file_of(masks, f"{name}{_MASK}") or (file_of(masks, own) if own else None)
+
+
+def write_flats(flats: Sequence[Flat], out: Path, threads: int, masks: Path | None = None) -> Iterator[str]:
     """Write pictures, and yield for each image why it could not be done; empty where it was done.
+
+    Args:
+        flats: what images become.
+        out: a folder that has folders `images` and, if there are masks, `masks`.
+        threads: images that are at work at once.
+        masks: folder of the masks; an image that has none gets a white one.
 
     Raises:
         InputError: if a picture cannot be written.
@@ -206,27 +250,63 @@ def write_flats(flats: Sequence[Flat], folder: Path, threads: int) -> Iterator[s
     def maps_of(camera_id: int, k: int) -> Maps:
         return _maps_of(flat_of[camera_id].camera, flat_of[camera_id].pinholes[k])
 
+    def write(flat: Flat) -> str:
+        picture, mask = read_picture(flat.file), None if masks is None else _read_mask(flat, masks)
+        why = _fault_of(picture, flat.camera, "picture") or (masks and _fault_of(mask, flat.camera, "mask"))
+        if why or picture is None:
+            return why or ""
+        for k, (pinhole, name) in enumerate(zip(flat.pinholes, flat.names, strict=True)):
+            maps = partial(maps_of, flat.camera.camera_id, k)
+            is_whole = pinhole.is_same and not any(pinhole.full_size)
+            if is_whole and flat.file.suffix == Path(name).suffix:
+                shutil.copyfile(flat.file, out / "images" / name)
+            else:
+                edge = cv2.BORDER_WRAP if flat.camera.is_spherical() else cv2.BORDER_REPLICATE
+                _write_picture(_drawn(picture, pinhole, maps, cv2.INTER_CUBIC, edge), out / "images" / name)
+            if mask is not None:
+                edge = cv2.BORDER_WRAP if flat.camera.is_spherical() else cv2.BORDER_CONSTANT
+                seen = _drawn(mask, pinhole, maps, cv2.INTER_NEAREST, edge) >= _HALF
+                _write_picture(_black_or_white(seen), out / "masks" / f"{name}{_MASK}")
+        return ""
+
     with quiet_log(), ThreadPoolExecutor(threads) as pool:
-        yield from pool.map(lambda flat: _write_flat(flat, folder, maps_of), flats)
+        yield from pool.map(write, flats)
 
 
-def _write_flat(flat: Flat, folder: Path, maps_of: Callable[[int, int], Maps]) -> str:
-    camera, picture = flat.camera, read_picture(flat.file)
+def _read_mask(flat: Flat, masks: Path) -> Rgb | None:
+    """Return 255 where an image is to be used, 0 where its mask is black; None if that cannot be read."""
+    file = mask_of(masks, flat.name)
+    if file is None:
+        return np.full((flat.camera.height, flat.camera.width), 255, np.uint8)
+    read = read_picture(file)
+    return None if read is None else _black_or_white(read.any(axis=2))
+
+
+def _black_or_white(is_used: npt.NDArray[np.bool_] | np.bool_) -> Rgb:
+    return np.where(is_used, 255, 0).astype(np.uint8)
+
+
+def _fault_of(picture: Rgb | None, camera: pycolmap.Camera, what: str) -> str:
+    """Return why a picture cannot be used; empty if it can."""
     if picture is None:
-        return "unreadable picture"
-    if picture.shape[:2] != (camera.height, camera.width):
-        return "picture of another size than its camera's"
-    edge = cv2.BORDER_WRAP if camera.is_spherical() else cv2.BORDER_REPLICATE
-    for k, (pinhole, name) in enumerate(zip(flat.pinholes, flat.names, strict=True)):
-        if pinhole.is_same and flat.file.suffix == Path(name).suffix:
-            shutil.copyfile(flat.file, folder / name)
-            continue
-        pixels = cv2.remap(picture, *maps_of(camera.camera_id, k), cv2.INTER_CUBIC, borderMode=edge)
-        bitmap = pycolmap.Bitmap.from_array(pixels)
-        bitmap.set_jpeg_quality(_JPEG_QUALITY)
-        if not bitmap.write(os.fsencode(folder / name)):
-            raise InputError(f"{folder / name} cannot be written; check the free space")
-    return ""
+        return f"unreadable {what}"
+    is_fitting = picture.shape[:2] == (camera.height, camera.width)
+    return "" if is_fitting else f"{what} of another size than its camera's"
+
+
+def _drawn(picture: Rgb, pinhole: Pinhole, maps: Callable[[], Maps], how: int, edge: int) -> Rgb:
+    """Return what a pinhole sees of a picture."""
+    seen = picture if pinhole.is_same else cv2.remap(picture, *maps(), how, borderMode=edge)
+    if any(pinhole.full_size):
+        seen = cv2.resize(seen, (pinhole.camera.width, pinhole.camera.height), interpolation=cv2.INTER_AREA)
+    return np.asarray(seen, dtype=np.uint8)
+
+
+def _write_picture(pixels: Rgb, file: Path) -> None:
+    bitmap = pycolmap.Bitmap.from_array(pixels)
+    bitmap.set_jpeg_quality(_JPEG_QUALITY)
+    if not bitmap.write(os.fsencode(file)):
+        raise InputError(f"{file} cannot be written; check the free space")
 
 
 def flatten_model(model: pycolmap.Reconstruction, flats: Sequence[Flat]) -> pycolmap.Reconstruction:

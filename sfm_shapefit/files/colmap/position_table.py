@@ -221,7 +221,7 @@ def _read_rows(
             raise InputError(f"{where}expected {_FORM}")
         name = cell_of["name"]
         if name in rows:
-            raise InputError(f"{where}{name} stands twice; keep one of its lines")
+            raise InputError(f"{where}{name} appears twice; keep one of its lines")
         rows[name] = _numbers(where, cell_of, columns.axes)
     positions = np.array([position for position, _ in rows.values()]).reshape(-1, 3)
     system = columns.system

@@ -250,7 +250,7 @@ def _cameras_of(file: _BinaryFile, counts: dict[int, int]) -> tuple[tuple[Lens, 
         if model_id not in num_params:
             raise file.fault(f"camera {camera_id} has the unknown camera model {model_id}")
         if camera_id in lenses:
-            raise file.fault(f"camera {camera_id} stands twice")
+            raise file.fault(f"camera {camera_id} appears twice")
         count = counts.get(model_id, num_params[model_id][1])
         params = file.take(struct.Struct(f"<{count}d"), f"camera {camera_id}")
         if not all(map(math.isfinite, params)):
@@ -296,7 +296,7 @@ def _read_images(files: ModelFiles, camera_ids: set[int]) -> _Images:
         if not name:
             raise file.fault(f"{label} has no name")
         if image_id in heads or name in names:
-            raise file.fault(f"{label} ({name.decode(errors='replace')}) stands twice")
+            raise file.fault(f"{label} ({name.decode(errors='replace')}) appears twice")
         count = file.take_count(POINT2D.itemsize, f"points of {label}")
         begin, end = end, end + count
         points2d[begin:end] = np.frombuffer(file.read(count * POINT2D.itemsize, label), dtype=POINT2D)
@@ -328,7 +328,7 @@ def _read_rigs(files: ModelFiles, camera_ids: set[int]) -> dict[int, RigRecord]:
         rig_id, num_sensors = map(int, file.take(RIG, "a rig"))
         label = f"rig {rig_id}"
         if rig_id in rigs:
-            raise file.fault(f"{label} stands twice")
+            raise file.fault(f"{label} appears twice")
         file.require_room(num_sensors, SENSOR_ID.size, f"sensors of {label}")
         sensors: dict[Sensor, FloatArray | None] = {}
         for k in range(num_sensors):
@@ -338,7 +338,7 @@ def _read_rigs(files: ModelFiles, camera_ids: set[int]) -> dict[int, RigRecord]:
                     f"{label} refers to camera {number}, which {files.beside('cameras')} does not have"
                 )
             if (kind, number) in sensors:
-                raise file.fault(f"{label} has a sensor that stands twice")
+                raise file.fault(f"{label} has a sensor that appears twice")
             has_pose = k > 0 and file.take(HAS_POSE, label)[0]
             pose = np.array(file.take(POSE, label)) if has_pose else None
             if pose is not None:
@@ -362,7 +362,7 @@ def _read_frames(files: ModelFiles, rigs: Mapping[int, RigRecord]) -> tuple[Fram
         number, rig, *pose, num_data = file.take(FRAME, "a frame")
         frame_id, rig_id, label = int(number), int(rig), f"frame {number}"
         if frame_id in heads:
-            raise file.fault(f"{label} stands twice")
+            raise file.fault(f"{label} appears twice")
         if rig_id not in rigs:
             raise file.fault(f"{label} refers to rig {rig_id}, which {files.beside('rigs')} does not have")
         file.refuse_pose(label, pose)
@@ -372,7 +372,7 @@ def _read_frames(files: ModelFiles, rigs: Mapping[int, RigRecord]) -> tuple[Fram
             if (kind, sensor_id) not in rigs[rig_id].sensors:
                 raise file.fault(f"{label} refers to sensor {sensor_id}, which rig {rig_id} does not have")
             if kind == CAMERA_SENSOR and image_id in taken:
-                raise file.fault(f"image {image_id} stands in two frames")
+                raise file.fault(f"image {image_id} is in two frames")
             if kind == CAMERA_SENSOR:
                 taken[image_id] = frame_id, sensor_id
         heads[frame_id] = (
@@ -459,7 +459,7 @@ def _take_points(file: _BinaryFile, model: ModelArrays) -> ModelArrays:
     file.finish()
     points, tracks = _ascending(heads.view(POINT3D).ravel(), elements.view("<u4").reshape(-1, 2))
     if len(repeated := points["id"][1:][points["id"][1:] == points["id"][:-1]]):
-        raise file.fault(f"3D point {repeated[0]} stands twice")
+        raise file.fault(f"3D point {repeated[0]} appears twice")
     return replace(model, points=points, tracks=tracks)
 
 

@@ -105,7 +105,7 @@ def world_of(datum: EarthDatum | None, centers: FloatArray, crs: str, offset: st
     if crs:
         if datum is None:
             raise InputError(
-                "the model has no datum, so that nothing says where on Earth it stands; convert the output "
+                "the model has no datum, so that nothing says where on Earth it is; convert the output "
                 "of locate or map with --priors or --control-points of known latitude and longitude"
             )
         world = World(datum=datum, code=epsg_code(crs, datum))
