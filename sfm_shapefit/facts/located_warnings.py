@@ -33,4 +33,5 @@ def located_warnings(result: LocateResult, of_scale: Sequence[str]) -> Iterator[
     yield from prior_warnings(result.prior_fit, images.names)
     yield from of_scale
     if options.trust.min_trust == 0.0:
-        yield from support_warnings([images.names[k] for k in np.flatnonzero(result.unsupported).tolist()])
+        unsupported = np.flatnonzero(result.support.unsupported).tolist()
+        yield from support_warnings([images.names[k] for k in unsupported])

@@ -49,7 +49,7 @@ from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import LOCAL_SHARE
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.straight import find_line, sigma_along
-from sfm_shapefit.judgement.support import EvidenceShares
+from sfm_shapefit.judgement.support import Support
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
 from sfm_shapefit.pairs.pair_directions import PairDirections
@@ -220,13 +220,8 @@ class LocateResult(_Placed):
     """Loops of the videos among the images, where `map` looked for some."""
     prior_fit: PriorFit | None = None
     """How well position priors fit the images and the `directions`; None where they do not set the scale."""
-    num_seen: IntArray
-    """(n,) number of points that an image saw, where it was left out because these were too few; else -1."""
-    unsupported: BoolArray
-    """(n,) images hardly any of whose matches makes a point with a third image; left out too, unless the
-    least trust is 0."""
-    observations: EvidenceShares
-    """Shares of keypoints that agree and contradict; None where there is no database."""
+    support: Support
+    """Images (n,) left out for their points, and which observations agree with the cameras."""
     evidence: ModelEvidence = field(default_factory=ModelEvidence)
     """What speaks against it although it fits."""
 
@@ -285,7 +280,7 @@ class LocateResult(_Placed):
             pairs={status.name.lower(): count for status, count in self.directions.counts().items()}
             | {"outlier": len(placement.rejected_pairs)},
             num_contradicting=placement.num_contradicting,
-            agreement=replace(self.observations, pairs=self.agreeing_pairs),
+            agreement=replace(self.support.observations, pairs=self.agreeing_pairs),
             num_points=model.num_points3D(),
             mean_reprojection_error_px=model.compute_mean_reprojection_error(),
             num_points_as_nodes=int(np.sum(placement.nodes >= placement.num_cameras)),
@@ -318,7 +313,7 @@ class LocateResult(_Placed):
         """Whether the model can be used, and why."""
         is_posed, elsewhere = self.placed.is_posed, self.elsewhere
         shares = Shares(
-            self.observations.contradicting or 0.0,
+            self.support.observations.contradicting or 0.0,
             placed=float(np.mean(is_posed if elsewhere is None else is_posed[~elsewhere])),
             placed_here=float(np.mean(is_posed)),
         )
@@ -408,12 +403,13 @@ class LocateResult(_Placed):
     @property
     def few_points(self) -> dict[int, int]:
         """Number of points that an image sees, by each image that was left out because of it."""
-        return {camera: int(self.num_seen[camera]) for camera in np.flatnonzero(self.num_seen >= 0).tolist()}
+        seen = self.support.num_seen
+        return {camera: int(seen[camera]) for camera in np.flatnonzero(seen >= 0).tolist()}
 
     @property
     def cameras_without_support(self) -> list[int]:
         """The images hardly any of whose matches makes a point with a third image, in the output or not."""
-        return np.flatnonzero(self.unsupported).tolist()
+        return np.flatnonzero(self.support.unsupported).tolist()
 
     def _not_trusted(self) -> dict[str, str]:
         """Return the images that are left out because they are not trusted, and why."""

@@ -24,7 +24,7 @@ from sfm_shapefit.placement.prior_fit import PriorFit, compare_with_priors
 
 def finish_model(state: ModelState, clock: Clock) -> LocateResult:
     """Return the result that all stages have led to."""
-    inputs, source, support = state.inputs, state.source, state.support
+    inputs, source = state.inputs, state.source
     with clock("model"):
         keypoints = source.view.keypoints if source.has_database else None
         seed = SeededModel.of(_resize_sensors(state), state.images, state.points, keypoints)
@@ -40,9 +40,7 @@ def finish_model(state: ModelState, clock: Clock) -> LocateResult:
         directions=state.directions,
         placement=state.judged,
         kept=state.kept,
-        num_seen=support.num_seen,
-        unsupported=support.unsupported,
-        observations=support.observations,
+        support=state.support,
         gauge=state.gauge,
         adjusted=state.bundle,
         adjustment=state.adjustment,

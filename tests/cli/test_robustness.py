@@ -50,7 +50,7 @@ def test_the_database_of_another_scene_gets_a_verdict():
     assert "verdict: do not use" in said
     assert "courtyard/database.db; no pair determines where cameras are\n" in said
     assert "contradict it and none agrees: is this the model's database?\n" in said
-    assert "second opinion: 8 cameras have nothing in common with where they stand" in said
+    assert "second opinion: 8 cameras have nothing in common with their places" in said
 
 
 def test_pairs_without_a_direction_do_not_contradict_a_model():

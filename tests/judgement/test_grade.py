@@ -67,7 +67,10 @@ def test_what_contradicts_makes_a_model_bad_and_what_sees_no_point_decides_nothi
     found, share, contradicting, grade
 ):
     verdict = replace(
-        found, observations=EvidenceShares(observations=share, contradicting=contradicting)
+        found,
+        support=found.support._replace(
+            observations=EvidenceShares(observations=share, contradicting=contradicting)
+        ),
     ).verdict
     assert verdict.grade is grade
     told = "51% of the observations contradict the cameras"

@@ -65,7 +65,7 @@ def arrays_of(found):
 
 def test_observations_of_right_cameras_agree(found):
     shares = shares_at(*arrays_of(found))
-    assert shares == found.observations
+    assert shares == found.support.observations
     assert shares.observations > 0.9
     assert shares.contradicting < 0.01
     assert shares_at(*arrays_of(found), apart=np.array([[1, 0], [2, 3]])) == shares

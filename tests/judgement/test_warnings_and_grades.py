@@ -53,7 +53,7 @@ def second_configuration(found):
 
 
 def unsupported(found):
-    told = replace(found, unsupported=np.arange(8) == 3)
+    told = replace(found, support=found.support._replace(unsupported=np.arange(8) == 3))
     return told, support_warnings([found.images.names[3]])
 
 

@@ -107,7 +107,7 @@ def test_a_camera_that_a_single_pair_holds_is_to_be_looked_at_and_no_more(tmp_pa
     thin = check(model, tmp_path / "once.db", second_opinion=False)
     assert thin.verdict.grade is Grade.LOOK
     assert "05.jpg" in thin.verdict.cameras
-    assert any("nothing checks how 1 camera (05.jpg) stands" in told for told in thin.facts.warnings)
+    assert any("nothing checks where 1 camera (05.jpg) is" in told for told in thin.facts.warnings)
 
 
 def has_image(model, point, name):

@@ -297,7 +297,7 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
         ("# nobody\n", "names no image"),
         ("".join(f"000{k}.jpg\n" for k in range(1, 9)), "every posed image of the model would be fixed"),
         (None, "does not exist"),
-        ("0001.jpg\n0002.jpg\n0003.jpg\n", "the 3 fixed cameras stand at one place"),
+        ("0001.jpg\n0002.jpg\n0003.jpg\n", "the 3 fixed cameras are at one place"),
     ],
 )
 def test_names_that_fit_nothing_and_cameras_without_positions_are_refused(tmp_path, text, message):

@@ -260,9 +260,9 @@ def test_what_cannot_be_compared_is_refused(model, thresholds, message):
 def test_cameras_that_all_stand_at_one_point_are_refused(point):
     good = scene(18)
     collapsed = replace(good, centers=np.full((20, 3), point))
-    with pytest.raises(InputError, match="all common cameras of the model stand at one point"):
+    with pytest.raises(InputError, match="all common cameras of the model are at one point"):
         evaluate_poses(collapsed, good)
-    with pytest.raises(InputError, match="all common cameras of the reference stand at one point"):
+    with pytest.raises(InputError, match="all common cameras of the reference are at one point"):
         evaluate_poses(good, collapsed)
 
 
