@@ -46,6 +46,7 @@ _BLOCK, _OVERLAP = 150, 0.15
 _GROUP = 12  # frames of a group; with thrice as many, iterations are a third more
 _GROUPS_OF_A_NODE = 4  # groups whose similarities a frame weighs at most; the others weigh next to nothing
 _OWN_SHARE = 0.2  # weight of a frame's own group, over that of its neighbors; they make it smooth
+_PAIRS_AT_ONCE = 100_000  # pairs of nodes whose groups are listed; they take 50 MB
 _SIMILARITY = 7  # unknowns of a group; three shifts, three turns, one scaling
 # Shares of the diagonal that are added to it, in turn until there is a factor: of 32 bits for a block, as its
 # rounding only costs iterations, and of 64 for the coarse system, where the least motions are.
@@ -303,12 +304,15 @@ def _group_frames(num_frames: int, ties: IntArray, strengths: FloatArray) -> tup
 
 def _pairs_of_groups(groups: IntArray, weights: FloatArray, pairs: IntArray, count: int) -> IntArray:
     """Return the pairs of groups (K, 2), sorted, g < h, that a node or a pair of nodes ties."""
-    nodes = np.arange(len(groups))
-    i, j = np.append(pairs[:, 0], nodes), np.append(pairs[:, 1], nodes)
-    g, h = np.broadcast_arrays(groups[i, :, None], groups[j, None, :])
-    tied = (weights[i, :, None] > 0.0) & (weights[j, None, :] > 0.0) & (g != h)
-    g, h = g[tied], h[tied]
-    return np.stack(np.divmod(distinct(np.minimum(g, h) * count + np.maximum(g, h)), count), axis=1)
+    nodes, keys = np.arange(len(groups)), [np.empty(0, np.int64)]
+    ends = np.concatenate([pairs, np.stack([nodes, nodes], axis=1)])
+    for first in range(0, len(ends), _PAIRS_AT_ONCE):
+        i, j = ends[first : first + _PAIRS_AT_ONCE].T
+        g, h = np.broadcast_arrays(groups[i, :, None], groups[j, None, :])
+        tied = (weights[i, :, None] > 0.0) & (weights[j, None, :] > 0.0) & (g != h)
+        g, h = g[tied], h[tied]
+        keys.append(distinct(np.minimum(g, h) * count + np.maximum(g, h)))
+    return np.stack(np.divmod(distinct(np.concatenate(keys)), count), axis=1)
 
 
 @kernel

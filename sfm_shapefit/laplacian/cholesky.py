@@ -205,7 +205,7 @@ def _factor_all(factor: CholeskyFactor, given: _Input) -> tuple[bool, FloatArray
         if failed[below].any():
             failed[unit] = True
             return
-        with memory.room(unit, memory.leaving(unit), memory.entering(unit)):
+        with memory.room(unit, memory.leaving[unit], memory.entering[unit]):
             failed[unit] = _factor_unit(factor, given, stack, run, is_large, pivots[unit])
 
     is_shared &= memory.num_arenas > 1

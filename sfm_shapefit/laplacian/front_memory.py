@@ -8,7 +8,6 @@ from queue import SimpleQueue
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
 
@@ -27,30 +26,27 @@ class FrontMemory:
         self.num_arenas = min(threads, len(self.units))
         """Number of units that can be at work."""
         parent, unit_of, arenas = plan.parent, plan.unit_of, self.num_arenas * plan.arena_size
-        self._is_inside = (parent >= 0) & (unit_of[parent] == unit_of)
-        self._leaving = np.flatnonzero((parent >= 0) & ~self._is_inside)
-        self._goes_to, self._areas = unit_of[parent[self._leaving]], np.diff(plan.row_pointers) ** 2
-        self.offsets[self._leaving] += arenas
+        self._is_inside, self._areas = unit_of[parent] == unit_of, np.diff(plan.row_pointers) ** 2
+        between = np.flatnonzero((parent >= 0) & ~self._is_inside)
+        self.leaving: list[list[int]] = [[] for _ in self.units]
+        """For each unit its supernodes whose parents are in others."""
+        self.entering: list[list[int]] = [[] for _ in self.units]
+        """For each unit the supernodes of others whose parents are in it."""
+        for s, start, end in zip(between, unit_of[between], unit_of[parent[between]], strict=True):
+            self.leaving[start].append(int(s))
+            self.entering[end].append(int(s))
+        self.offsets[between] += arenas
         self.size = arenas + plan.stack_size
         """(Block) entries in all."""
         if self.num_arenas > 1:  # enough for any order; the last places are hardly ever touched
-            self.size = arenas + int(self._areas[self._leaving].sum())
+            self.size = arenas + int(self._areas[between].sum())
         self._free, self._lock, self._arena_size = [(arenas, self.size)], threading.Lock(), plan.arena_size
         self._arenas = SimpleQueue[int]()
         for k in range(self.num_arenas):
             self._arenas.put(k)
 
-    def leaving(self, unit: int) -> IntArray:
-        """Return the supernodes of a unit whose parents are in others."""
-        begin, end = np.searchsorted(self._leaving, self.units[unit]).tolist()
-        return np.asarray(self._leaving[begin:end])
-
-    def entering(self, unit: int) -> IntArray:
-        """Return the supernodes of other units whose parents are in this one."""
-        return np.asarray(self._leaving[self._goes_to == unit])
-
     @contextmanager
-    def room(self, unit: int, made: IntArray, used: IntArray) -> Iterator[int]:
+    def room(self, unit: int, made: list[int], used: list[int]) -> Iterator[int]:
         """Have an arena, whose number is yielded, and places for `made`; free that and those of `used`."""
         begin, end = self.units[unit]
         arena = self._arenas.get()
@@ -60,7 +56,7 @@ class FrontMemory:
         self._give(used)
         self._arenas.put(arena)
 
-    def _take(self, made: IntArray) -> None:
+    def _take(self, made: list[int]) -> None:
         if self.num_arenas == 1:
             return
         with self._lock:
@@ -70,7 +66,7 @@ class FrontMemory:
                 self.offsets[s], end = self._free[k]
                 self._free[k] = int(self.offsets[s]) + size, end
 
-    def _give(self, used: IntArray) -> None:
+    def _give(self, used: list[int]) -> None:
         if self.num_arenas == 1:
             return
         with self._lock:

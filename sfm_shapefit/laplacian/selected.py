@@ -79,7 +79,7 @@ def selected_inverse(
     )  # fmt: skip
 
     def invert(unit: int) -> None:
-        with rooms.room(unit, rooms.entering(unit), rooms.leaving(unit)) as arena:
+        with rooms.room(unit, rooms.entering[unit], rooms.leaving[unit]) as arena:
             memory = _Memory(waiting, work[arena], starts[:-1], rooms.offsets, blas_of(panels.dtype))
             _invert(rooms.units[unit], plan_arrays, panels, memory, nodes, blocks)
 

@@ -46,7 +46,8 @@ from sfm_shapefit.scene.same_images import names_among
 from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 
-_ARBITRARY = ("input", "unit")
+ARBITRARY = ("input", "unit")
+"""Kinds of scale that give way to known lengths."""
 
 
 def measure_bars(
@@ -77,7 +78,7 @@ def usual_length(state: ModelState) -> LengthFacts | None:
     gauge = state.gauge
     axes = Axes(
         unit="m" if gauge.datum else UNITS[gauge.scale],
-        has_scale=gauge.scale not in _ARBITRARY,
+        has_scale=gauge.scale not in ARBITRARY,
         has_up=gauge.datum is not None or state.inputs.known.gravity is not None,
     )
     return length_between(state.images, state.points, state.estimate, scale_errors(state), axes)

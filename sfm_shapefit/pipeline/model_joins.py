@@ -31,7 +31,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.lengths import compare_bars
+from sfm_shapefit.pipeline.lengths import ARBITRARY, compare_bars
 from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.placement.gauge import Gauge
@@ -45,8 +45,6 @@ _SIGMA_OF = (
     "joined: what the models know of their cameras, and how well the joins are known; relative to the mean "
     "position and scale of the first"
 )
-# What says how large a model is; another scale has no meaning beside that of a known distance.
-_ARBITRARY = ("unit", "input")
 _SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
 
 
@@ -258,7 +256,7 @@ def _choose_scale(group: JoinedGroup, first: Gauge, join_inputs: JoinInputs) -> 
     """
     images, warning = read_model(group.reconstruction).images, ""
     distances = [one for one in join_inputs.distances if {*one[:2]} <= {*images.names}]
-    if first.scale in _ARBITRARY:
+    if first.scale in ARBITRARY:
         known = join_inputs.bars
         fit = known and fit_scale_bars(known, compare_bars(images, known, None, None).found)
         if known and fit:

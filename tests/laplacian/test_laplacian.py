@@ -284,7 +284,7 @@ def test_update_matrices_never_overlap_while_they_wait_whatever_the_order_of_uni
         ready = [u for u, below in enumerate(plan.needs) if done >= {*below} and u not in done | {*running}]
         if ready and len(running) < memory.num_arenas:
             unit = ready[0] if threads == 1 else rng.choice(ready)
-            running[unit] = memory.room(unit, memory.leaving(unit), memory.entering(unit))
+            running[unit] = memory.room(unit, memory.leaving[unit], memory.entering[unit])
             running[unit].__enter__()
             waiting |= dict.fromkeys(range(*plan.units[unit]), unit)
             placed = sorted((memory.offsets[s], memory.offsets[s] + areas[s], s) for s in waiting if areas[s])
@@ -296,8 +296,8 @@ def test_update_matrices_never_overlap_while_they_wait_whatever_the_order_of_uni
             unit = rng.choice(list(running))
             running.pop(unit).__exit__(None, None, None)
             done.add(unit)
-            left = {*memory.leaving(unit).tolist()}
-            used = {*memory.entering(unit).tolist()}
+            left = {*memory.leaving[unit]}
+            used = {*memory.entering[unit]}
             waiting = {s: u for s, u in waiting.items() if (u != unit or s in left) and s not in used}
 
 
