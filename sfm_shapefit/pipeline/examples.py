@@ -8,7 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit import evaluate, inspect, locate, map_database, place, relative_rotations, solve, synthetic
+from sfm_shapefit import (
+    evaluate,
+    inspect,
+    join,
+    locate,
+    map_database,
+    place,
+    relative_rotations,
+    solve,
+    synthetic,
+)
 from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.covariance import estimate_covariances
@@ -53,10 +63,12 @@ def _long_graph(num_nodes: int = 300) -> ViewGraph:
     return synthetic.ring_graph_problem(num_nodes, 8.0, sigma=0.02, q=0.1, seed=1).view_graph
 
 
-def _workspace(folder: Path, options: WorkspaceOptions | None = None, *, wrong: float = 0.0) -> Path:
-    """Write eight images of a ring, a share of whose pairs is wrong, and return the folder of the model."""
+def _workspace(
+    folder: Path, options: WorkspaceOptions | None = None, *, wrong: float = 0.0, num_images: int = 8
+) -> Path:
+    """Write images of a ring, a share of whose pairs is wrong, and return the folder of the model."""
     scene = synthetic.make_scene(
-        SceneOptions(shape="ring", num_images=8, num_points=300, corrupted_pair_fraction=wrong)
+        SceneOptions(shape="ring", num_images=num_images, num_points=300, corrupted_pair_fraction=wrong)
     )
     write_workspace(scene, folder / "ring", options)
     return folder / "ring" / "sparse" / "0"
@@ -192,6 +204,18 @@ def map_matches(folder: Path) -> None:
     """Map a database, and refine the rotations."""
     model = _workspace(folder, WorkspaceOptions(model="rotations"))
     map_database(model.parents[1] / "database.db")
+
+
+def join_halves(folder: Path) -> None:
+    """Map two halves of a ring apart, and join them by the pairs between."""
+    model = _workspace(folder, WorkspaceOptions(model="rotations"), num_images=12)
+    database = model.parents[1] / "database.db"
+    names = read_model(model).images.names
+    across = folder / "across.txt"
+    across.write_text("\n".join(f"{a},{b}" for a in names[:6] for b in names[6:]))
+    halves = map_database(database, without=str(across))
+    paths = [half.write(folder / f"half{number}") for number, half in enumerate(halves.models)]
+    join(paths, database=database)
 
 
 def relate_images(folder: Path) -> None:

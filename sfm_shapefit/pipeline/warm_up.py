@@ -63,6 +63,7 @@ FURTHER = (
     "solve_iteratively",
     "map_matches",
     "relate_images",
+    "join_halves",
 )
 """Examples of the rest; that which takes longest first, or it would be waited for.
 
