@@ -164,8 +164,8 @@ def _refuse_without_use(
         raise InputError("a second opinion needs the database of MODEL; name it with --database")
     if images is not None and report is None and known is not None:
         raise InputError(
-            f"the images are not asked, since the matches are those of {known}; "
-            "leave them out, or name a page for them with --report"
+            f"with a database ({known}), its matches are used and the images are not matched anew; "
+            "leave --images out, or show the images on a page with --report"
         )
     if max_minutes is not None and (images is None or known is not None):
         raise InputError("--max-minutes is for images without a database; name their folder with --images")

@@ -208,7 +208,7 @@ class ComponentAveraging(NamedTuple):
             members = waiting.pop(0)
             if len(members) < least:
                 if len(members) > 1:
-                    few = f"matched with only {_others(len(members) - 1)}; a model needs {least}"
+                    few = f"matches tie it only into {_group(len(members))}; a model needs {least}"
                     reasons |= dict.fromkeys(members.tolist(), few)
                 continue
             inside, local = pairs_among(relative, members)
@@ -226,7 +226,7 @@ class ComponentAveraging(NamedTuple):
             if len(kept) >= least:
                 yield kept, answer.subset(answer.registered)
             else:
-                tied = f"pairs that can be believed tie it to only {_others(len(kept) - 1)}"
+                tied = f"pairs that can be believed tie it only into {_group(len(kept))}"
                 reasons |= dict.fromkeys(kept.tolist(), f"{tied}; a model needs {least}")
 
     def _average_component(
@@ -265,9 +265,9 @@ def pairs_among(
     return inside, replace(inside, pairs=np.searchsorted(members, inside.pairs))
 
 
-def _others(count: int) -> str:
-    """Count other frames, which are images where no rig is."""
-    return f"{counted(count, 'other image')} (or frame of a rig)"
+def _group(count: int) -> str:
+    """Count the frames of a group; without rigs, each is an image."""
+    return f"a group of {counted(count, 'image')} (a frame of a rig counts as one)"
 
 
 def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:

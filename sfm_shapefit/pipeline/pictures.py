@@ -33,6 +33,15 @@ from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.structure_options import StructureOptions
 
 _FOR_FEATURES = 0.6  # share of the minutes; features take half of the time where there is no limit
+_WHY_ASKED = {
+    "neighbors": "near in pose",
+    "shared": "with many common points",
+    "unshared": "near without common points",
+    "alike": "that look alike",
+    "seams": "across a weak link",
+    "others": "further",
+}
+"""What is said of a pair by why it was chosen."""
 
 
 @contextmanager
@@ -89,7 +98,7 @@ def _state(folder: Path, states: Sequence[str], reasons: Sequence[str], count: i
     pairs = counted(count, "pair") if count == len(reasons) else f"{count:,} of {len(reasons):,} chosen pairs"
     num_asked = states.count("asked")
     pictures = f"{num_asked:,} of {counted(len(states), 'picture')}{without} in {folder}"
-    return f"{pictures}, {pairs}: {_whys(reasons[:count])}"
+    return f"{pictures}, {pairs}: {_whys([_WHY_ASKED[why] for why in reasons[:count]])}"
 
 
 def _whys(whys: Sequence[str]) -> str:

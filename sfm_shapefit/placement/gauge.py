@@ -160,7 +160,8 @@ def unit_gauge(locations: FloatArray, because: str = "") -> Gauge:
     """Return the gauge with the centroid (of locations (n, 3)) at 0 and the median distance from it 1."""
     centroid = locations.mean(axis=0)
     scale = 1.0 / float(np.median(np.linalg.norm(locations - centroid, axis=1)))
-    statement = f"unit: {because}the median distance of the cameras from their centroid, the origin, is 1"
+    where = "the origin is the centroid of the cameras, and their median distance from it is 1"
+    statement = f"unit: {because}{where}"
     return Gauge(similarity=_keep_axes(scale, -scale * centroid), scale="unit", statement=statement)
 
 

@@ -21,19 +21,20 @@ def averaged(pairs, weight_shares, **options):
 
 
 SOUND, UNSOUND = 0.9, 0.2
+OF_TWO = "a group of 2 images (a frame of a rig counts as one)"
 
 
 def test_each_frame_of_a_component_too_small_once_averaged_is_told_so():
     groups, reasons = averaged([(0, 1), (1, 2)], [SOUND, UNSOUND])
     assert groups == []
-    few = "pairs that can be believed tie it to only 1 other image (or frame of a rig); a model needs 3"
+    few = f"pairs that can be believed tie it only into {OF_TWO}; a model needs 3"
     assert (reasons[0], reasons[1]) == (few, few)
     assert reasons[2].startswith("no pair that can be believed ties it to the others")
 
 
 def test_frames_of_too_few_pairs_are_told_how_few():
     _, reasons = averaged([(0, 1), (2, 3), (3, 4), (2, 4)], [SOUND] * 4)
-    few = "matched with only 1 other image (or frame of a rig); a model needs 3"
+    few = f"matches tie it only into {OF_TWO}; a model needs 3"
     assert (reasons[0], reasons[1]) == (few, few)
 
 

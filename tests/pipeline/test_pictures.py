@@ -42,7 +42,7 @@ def test_poses_alone_are_good_by_their_pictures_and_nothing_is_written(drawn):
     result = run("check", drawn / "sparse" / "0", "--images", drawn / "images", "--no-second-opinion", code=0)
     assert "verdict: good" in result.output
     assert "8 of 8 pictures in" in result.output
-    assert "neighbors" in result.output
+    assert "near in pose" in result.output
     assert f"map {drawn / 'images'} mapped" in result.output  # the next step knows the folder
     assert fingerprint(drawn) == before
 
@@ -112,7 +112,7 @@ def test_what_cannot_be_asked_is_said_in_one_sentence(drawn, tmp_path):
     assert "is no folder" in run_refused("check", model, "--images", tmp_path / "none")
     assert "name their folder" in run_refused("check", model, "--max-minutes", "1")
     beside = run_refused("check", RING / "sparse" / "0", "--images", drawn / "images")
-    assert "the images are not asked, since the matches are those of" in beside
+    assert "its matches are used and the images are not matched anew" in beside
     with pytest.raises(InputError, match="max_minutes"):
         check(model, images=drawn / "images", max_minutes=-1.0)
 

@@ -16,7 +16,7 @@ SCENE = "const scene = document.getElementById('scene').scene;"
 LABELS = "return [...document.querySelectorAll('#overlay .label')].map((one) => one.textContent);"
 TARGET = SCENE + "return scene.view.target;"
 SELECTED = "return document.getElementById('scene').dataset.selected;"
-# The canvas as drawn just now: its commonest color, the share of others, their number, and the red pixels.
+# The canvas as drawn just now: its commonest color, the share and number of others, red pixels, the brightest red.
 COLORS = """
     const scene = document.getElementById('scene').scene, canvas = document.getElementById('canvas');
     scene.draw();
@@ -24,15 +24,17 @@ COLORS = """
     [copy.width, copy.height] = [canvas.width, canvas.height];
     const pen = copy.getContext('2d');
     pen.drawImage(canvas, 0, 0);
-    let red = 0;
+    let [red, brightest] = [0, 0];
     const seen = new Map(), {data} = pen.getImageData(0, 0, copy.width, copy.height);
     for (let k = 0; k < data.length; k += 4) {
         const shade = data[k] * 65536 + data[k + 1] * 256 + data[k + 2];
         if (data[k] > 220 && data[k + 1] < 40 && data[k + 2] < 40) red += 1;
+        brightest = Math.max(brightest, data[k]);
         seen.set(shade, (seen.get(shade) || 0) + 1);
     }
     const sorted = [...seen].sort((a, b) => b[1] - a[1]);
-    return {common: sorted[0][0], drawn: 1 - 4 * sorted[0][1] / data.length, count: seen.size, red};
+    return {common: sorted[0][0], drawn: 1 - 4 * sorted[0][1] / data.length, count: seen.size, red,
+        brightest};
 """
 
 
@@ -126,6 +128,36 @@ def test_a_click_on_a_row_chooses_its_camera_flies_there_and_the_scene_stays_in_
     assert chosen.get_attribute("data-row") == str(k)
 
 
+# What the column of the scene covers of other cards, while the page is scrolled in steps of 50 pixels.
+COVERED = """
+    const covered = [], column = document.getElementById('stage');
+    const isClipped = getComputedStyle(column).overflowY !== 'visible';
+    const cards = [...document.querySelectorAll('.findings > *, .more > *, .experts')];
+    for (let y = 0; y < document.documentElement.scrollHeight; y += 50) {
+        scrollTo({top: y, behavior: 'instant'});
+        const boxes = isClipped ? [column] : [...column.children];
+        for (const own of boxes.map((one) => one.getBoundingClientRect())) for (const card of cards) {
+            const box = card.getBoundingClientRect();
+            const width = Math.min(own.right, box.right) - Math.max(own.left, box.left);
+            const height = Math.min(own.bottom, box.bottom) - Math.max(own.top, box.top);
+            if (width > 1 && height > 1) covered.push([y, height, card.textContent.slice(0, 30)]);
+        }
+    }
+    return covered;
+"""
+
+
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (1280, 720), (1200, 480)])
+def test_what_is_chosen_covers_nothing_wherever_the_page_is_scrolled_to(driver, report, width, height):
+    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    click(driver, "#cameras tbody tr")
+    assert driver.execute_script(COVERED) == []
+    driver.execute_script("document.querySelector('#details details').open = true")
+    assert driver.execute_script(COVERED) == []
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", {**size, "width": 1400, "height": 1000})
+
+
 def test_a_click_in_the_scene_takes_the_camera_and_not_a_pair_drawn_over_it(driver, report):
     from selenium.webdriver import ActionChains
 
@@ -204,7 +236,7 @@ def test_layers_sizes_colors_and_the_theme_can_be_switched_and_the_scene_follows
     background = driver.execute_script(page)
     click(driver, "#theme")
     assert driver.execute_script(page) != background
-    assert driver.execute_script(COLORS)["common"] == before["common"]  # the ground that shows the points
+    assert driver.execute_script(COLORS)["common"] == before["common"]  # the ground that shows light points
     assert complaints(driver) == []
 
 
@@ -226,15 +258,24 @@ def test_the_ground_is_light_behind_dark_points_and_dark_behind_light_ones(drive
     ground = driver.execute_script(COLORS)["common"]
     red = ground >> 16
     assert red < 64 if shade == 230 else red > 192
+    # A dark page has a dark ground, on which points are to be seen, too.
+    driver.execute_script(f"{SCENE} scene.layers.forEach((one) => {{ one.shown = one.name === 'points'; }});")
+    click(driver, "#theme")
+    seen = driver.execute_script(COLORS)
+    assert seen["common"] >> 16 < 64
+    assert seen["brightest"] >= 120
 
 
 def test_it_fits_a_narrow_window_and_a_row_brings_the_scene_into_view(driver, report):
+    opened(driver, report)
     size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": False}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     wait_for(driver, "return document.documentElement.scrollWidth <= 390")
     # Charts are drawn anew for the width, and every text of them is to be seen.
     wait_for(driver, "return document.querySelector('#histogram svg').viewBox.baseVal.width < 390")
     assert driver.execute_script(CUT_TEXTS) == []
+    whole = "return [...document.querySelectorAll('#command, #lenses .scroll, #pieces .scroll')]"
+    assert driver.execute_script(f"{whole}.filter((one) => one.scrollWidth > one.clientWidth).length") == 0
     driver.execute_script("document.querySelector('#pairs tbody tr').scrollIntoView()")
     click(driver, "#pairs tbody tr")
     wait_for(

@@ -73,7 +73,11 @@ const plainTable = (names, rows) => {
   const head = table.createTHead().insertRow();
   for (const name of names) head.append(element("th", name));
   const body = table.createTBody();
-  for (const texts of rows) body.insertRow().append(...texts.map((text) => element("td", text)));
+  for (const texts of rows) {
+    const row = body.insertRow();
+    row.append(...texts.map((text) => element("td", text)));
+    names.forEach((name, k) => { row.cells[k].dataset.label = name; }); // narrow windows show it beside the text
+  }
   const scroll = element("div", "", "scroll");
   scroll.append(table);
   return scroll;

@@ -7,6 +7,7 @@ const MOST_PAIRS = 4000;
 const FAR_DEG = 1; // pairs that contradict by less are not drawn either
 const PICK_CAMERA_PX = 11;
 const PICK_PAIR_PX = 5;
+const LEAST_ON_DARK = 120; // brightest channel of a point on a dark ground, of 255; the ground has 47
 const SLOW_FRAME_MS = 50;
 const REST_MS = 200; // the scene rests so long after the last move, and the time of two frames
 const COARSEST = 3; // levels of detail while the scene moves
@@ -83,17 +84,20 @@ const makeScene = (onChoice) => {
     return { center, u: u.map((part, k) => part - center[k]) };
   };
   const ellipsoidColumns = (chosen) => ({ center: gather(chosen, cameras.center, 3), ...vectorsOf(chosen, cameras.ellipsoids) });
-  // Dark points would vanish on a dark ground and light ones on a light ground; points without colors are gray.
+  // Light points would vanish on a light ground: theirs is always dark. On a dark ground, dark points are lifted.
+  // Points without colors are gray.
   const pointOrder = spread(points.positions.length / 3);
   const isGray = points.colors.every((part) => part === 0);
-  if (!isGray) $("scene").dataset.ground = quantile(points.colors, 0.5) < 128 ? "light" : "dark";
+  if (!isGray && quantile(points.colors, 0.5) >= 128) $("scene").dataset.ground = "dark";
   const pointColors = () => {
     const colors = gather(pointOrder, points.colors, 3);
     const gray = rgbOf("--soft").map((part) => 255 * part);
+    const least = rgbOf("--ground")[0] < 0.5 ? LEAST_ON_DARK : 0;
     const found = new Uint8Array((4 * colors.length) / 3);
     for (let k = 0, to = 0; k < colors.length; k += 3, to += 4) {
+      const lift = Math.max(least - Math.max(colors[k], colors[k + 1], colors[k + 2]), 0);
       for (let c = 0; c < 3; c++) {
-        found[to + c] = isGray ? gray[c] : colors[k + c];
+        found[to + c] = isGray ? gray[c] : colors[k + c] + lift;
       }
       found[to + 3] = 255;
     }
@@ -184,7 +188,7 @@ const makeScene = (onChoice) => {
       if (isDrawn(p)) drawn.push(p);
     }
     if (!drawn.length) return;
-    const said = ["Pairs that agree", "that contradict", "that cannot be judged", "without a direction"][verdict];
+    const said = `Pairs ${["that agree", "that contradict", "that cannot be judged", "without a direction"][verdict]}`;
     const amount = drawn.length === total ? count(total) : `${count(drawn.length)} of ${count(total)}`;
     const limit = verdict === 0 ? (points.positions.length ? MANY_PAIRS : MANY_WITHOUT_POINTS)
       : verdict === 1 ? MANY_WRONG : MOST_PAIRS;
