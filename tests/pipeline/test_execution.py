@@ -46,7 +46,7 @@ class Counting:
     def submit(self, work, *given):
         if len(self.asked) == self.leaves_at:
             cluster = self.workers.client.cluster
-            cluster.sync(cluster.workers[min(cluster.workers)].close, timeout=0, executor_wait=False)
+            cluster.sync(cluster.workers[min(cluster.workers)].close, executor_wait=False)
         self.asked.append(work.__name__)
         return self.workers.submit(work, *given)
 
