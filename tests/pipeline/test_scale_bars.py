@@ -235,7 +235,7 @@ def test_bars_that_make_a_model_one_point_are_refused(ring, tmp_path):
 
 
 def test_lengths_that_are_none_are_told(ring):
-    with pytest.raises(InputError, match="0001.jpg and 0001.jpg are one place, and no length; name"):
+    with pytest.raises(InputError, match=r"0001.jpg and 0001.jpg are one place, and no length"):
         sfm_shapefit.evaluate_lengths(ring, [("0001.jpg", "0001.jpg")])
     few = pycolmap.Reconstruction(ring)
     for point in sorted(few.points3D)[1:]:
