@@ -163,16 +163,7 @@ class LocateResult(_Placed):
 
     _PUBLIC = (
         *("reconstruction", "cameras", "pairs", "table", "warnings", "database", "options", "timings_s"),
-        *(
-            "gauge",
-            "intrinsics",
-            "rigs",
-            "control_points",
-            "scale_bars",
-            "further",
-            "certified",
-            "adjustment",
-        ),
+        *("gauge", "intrinsics", "rigs", "control_points", "scale_bars", "certified", "adjustment"),
     )
     seed: ModelInArrays
     """The output, as `reconstruction` and `write` have it."""

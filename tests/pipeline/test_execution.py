@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import signal
+import time
 from functools import partial
 
 import numpy as np
@@ -37,7 +38,10 @@ ESTIMATE = partial(estimate_directions, options=DirectionOptions())
 
 @dataclasses.dataclass
 class Counting:
-    """Workers that note what they are asked to do, and of which the first leaves before some task."""
+    """Workers that note what they are asked to do, and of which the first leaves before some task.
+
+    It leaves between two tasks, since a thread cannot be killed within one; what it keeps is lost.
+    """
 
     workers: DaskWorkers
     leaves_at: int = -1
@@ -45,8 +49,10 @@ class Counting:
 
     def submit(self, work, *given):
         if len(self.asked) == self.leaves_at:
-            cluster = self.workers.client.cluster
-            cluster.sync(cluster.workers[min(cluster.workers)].close, executor_wait=False)
+            client, cluster = self.workers.client, self.workers.client.cluster
+            while any(client.processing().values()):
+                time.sleep(0.01)
+            cluster.sync(cluster.workers[min(cluster.workers)].close)
         self.asked.append(work.__name__)
         return self.workers.submit(work, *given)
 

@@ -13,13 +13,12 @@ import numpy as np
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import tangent_bases
 from sfm_shapefit.files.colmap.lenses import rays_of
+from sfm_shapefit.files.colmap.position_table import LARGEST
 from sfm_shapefit.files.lines import is_number, text_of
 from sfm_shapefit.scene.given import MarkedViews, Marks
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
 
-LARGEST = 1e30
-"""Units; squares of squares of larger coordinates overflow."""
 _CHECK_PREFIX, _CHECK_WORD = "chk-", "check"
 _OUTSIDE_PX = 1.0  # pixels beyond the edge of a picture; programs count from the middle or edge of a pixel
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.files.colmap.marks import LARGEST, Mark, lines_of, marks_in, read_marks
+from sfm_shapefit.files.colmap.marks import Mark, lines_of, marks_in, read_marks
+from sfm_shapefit.files.colmap.position_table import LARGEST
 from sfm_shapefit.scene.given import ScaleBars
 from sfm_shapefit.scene.images import Images
 
