@@ -16,7 +16,7 @@ SCENE = "const scene = document.getElementById('scene').scene;"
 LABELS = "return [...document.querySelectorAll('#overlay .label')].map((one) => one.textContent);"
 TARGET = SCENE + "return scene.view.target;"
 SELECTED = "return document.getElementById('scene').dataset.selected;"
-# The canvas as drawn just now: its commonest color, the share and number of others, red pixels, the brightest red.
+# The canvas as drawn now: its commonest color, share and number of others, red pixels, the brightest red.
 COLORS = """
     const scene = document.getElementById('scene').scene, canvas = document.getElementById('canvas');
     scene.draw();
