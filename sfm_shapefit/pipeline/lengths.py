@@ -149,8 +149,10 @@ def evaluate_lengths(
 
     Raises:
         InputError: if the model or the bars cannot be used, or it has no such image or point.
-        UnsolvableError: if nothing is known of errors: where images observe no points, or are above 2,000.
+        UnsolvableError: if nothing is known of the errors of the `ends`: where images observe no points, or
+            are above 2,000. Without `ends`, `usual` is None then.
     """
+    _refuse_no_pairs(ends)
     posed = read_by_itself(model, with_lenses=True)
     seen = images, points, estimate = _estimate_of(posed)
     scale_sigma = model_scale_sigma(model)
@@ -167,6 +169,15 @@ def evaluate_lengths(
         scale_sigma=scale_sigma,
         warnings=[*posed.notes, *(bars.warnings() if bars else ())],
     )
+
+
+def _refuse_no_pairs(ends: object) -> None:
+    """Refuse what is no list of pairs, one pair outside a list included."""
+    listed = ends if isinstance(ends, list | tuple) else [ends]
+    if not all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in listed):
+        raise InputError(
+            'ends must be a list of pairs of places, such as [("0001.jpg", "0004.jpg"), (17, 402)]'
+        )
 
 
 def _num_draws(estimate: Estimate | None) -> int:
@@ -201,13 +212,19 @@ def _between(
     for first, second in ends:
         assert estimate is not None
         rows = np.array([_row_of(images, points, end) for end in (first, second)])
+        if rows[0] == rows[1]:
+            raise InputError(f"{first} and {second} are the same place; name two places for a length")
         own, chosen = rows < images.num_images, rows - images.num_images
         cameras = errors_of_images(images, draws_at(estimate, images))
         places = cameras.followed_by(_errors_of(images, points, estimate, chosen[~own]))
         rows[~own] = images.num_images + np.arange(np.sum(~own))
         apart = places.apart(rows[None]).in_scale(scale)
-        if found := tell_length(apart, float(apart.lengths[0]), axes):
-            yield LengthBetween(first=str(first), second=str(second), length=found)
+        found = tell_length(apart, float(apart.lengths[0]), axes)
+        if found is None:
+            raise UnsolvableError(
+                f"nothing is known of the error of the distance from {first} to {second}; leave it out"
+            )
+        yield LengthBetween(first=str(first), second=str(second), length=found)
 
 
 def _row_of(images: Images, points: Points, end: str | int) -> int:
