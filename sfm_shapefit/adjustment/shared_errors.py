@@ -51,6 +51,7 @@ from sfm_shapefit.adjustment.projection import (
 from sfm_shapefit.adjustment.residuals import chunks_of, kernel_inputs
 from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import METRIC_SIGMA
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.losses import CAUCHY, weighed
@@ -111,10 +112,12 @@ def estimate_center_errors(
             one for each frame.
 
     Raises:
-        UnsolvableError: if the observations leave more open than a similarity.
+        UnsolvableError: if the observations leave more open than a similarity, or no camera sees its points.
     """
     errors = reprojection_errors_px(problem)
     errors = errors[np.isfinite(errors)]
+    if not len(errors):
+        raise UnsolvableError("no camera sees a point that it observes, so that nothing tells errors")
     scale = np.inf if options.loss_scale_px is None else options.loss_scale_px
     weights = weighed(CAUCHY, 1.0, (errors / scale) ** 2)
     kappa = float(np.sum(weights**2) / np.sum(weights))

@@ -208,7 +208,7 @@ def choose_loss_scale_px(problem: AdjustmentProblem, scales_px: Sequence[float])
     def variance(scale_px: float) -> float:
         weights = weighed(CAUCHY, 1.0, squares / scale_px**2)
         slope = float(np.sum(left * weights**2))  # (div psi) / 2 = w - w^2 |r|^2 / c^2 = w^2
-        return float(np.sum(left * weights**2 * squares)) / max(slope, 1e-300) ** 2
+        return float(np.sum(left * weights**2 * squares)) / max(slope**2, 1e-300)
 
     return min(scales_px, key=variance)
 

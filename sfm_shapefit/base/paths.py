@@ -52,5 +52,5 @@ def file_of(folder: Path, name: str) -> Path | None:
     try:
         path, root = (folder / name).resolve(), folder.resolve()
         return path if path.is_relative_to(root) and path.is_file() else None
-    except (OSError, ValueError):
+    except (OSError, ValueError, RuntimeError):  # the last for links that go round in circles
         return None

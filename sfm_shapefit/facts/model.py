@@ -358,6 +358,7 @@ class CheckedFacts(FactsOfModel):
         """Return what to do next, by the verdict and by what was asked."""
         path, second, verdict = shlex.quote(self.inputs.path), self.evidence.second, self.verdict
         is_alike = second is not None and second.is_alike
+        is_equal = second is not None and second.grade is verdict.grade and not verdict.doubts_database
         is_sound = verdict.grade is Grade.GOOD or (verdict.grade is Grade.LOOK and is_alike)
         if is_sound and self.num_points:  # poses alone, as of a list, are to be placed with points
             return _next_in(self.inputs.path, verdict.grade, self)
@@ -365,7 +366,7 @@ class CheckedFacts(FactsOfModel):
             second is not None
             and not is_alike
             and self.inputs.database
-            and (second.wrong or second.grade.is_better_than(verdict.grade))
+            and (second.wrong or second.grade.is_better_than(verdict.grade) or is_equal)
         ):
             return self._next_of_map(second)
         if any(one.kind is Kind.LENS for one in verdict.findings) and not self.evidence.lenses:

@@ -50,7 +50,7 @@ def image_quality(points: Points, images: Images, pictures: KeypointRays) -> Ima
         if len(rows):
             lens = images.lenses[images.lens_of[k]]
             errors[k], tracks[k] = misses_px[rows].mean(), np.median(lengths[seen[rows]])
-            places = pictures.pixels(k, points.keypoints[rows]) / [lens.width, lens.height]
+            places = pictures.pixels(k, points.keypoints[rows]) / np.maximum([lens.width, lens.height], 1)
             cells = np.clip(_CELLS * places, 0, _CELLS - 1).astype(np.int64)
             coverage[k] = len(np.unique(cells, axis=0)) / _CELLS**2
     return ImageQuality(

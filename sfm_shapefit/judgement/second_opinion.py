@@ -55,6 +55,9 @@ class SecondOpinion(Record):
     undecided: Annotated[
         tuple[str, ...], "Images that stand elsewhere there, where pairs support neither."
     ] = ()
+    farthest: Annotated[
+        float, "Largest distance of an image that is elsewhere, in the same unit; else 0."
+    ] = 0.0
     num_for: Annotated[int, "Pairs that support this model against the other, of wrong images."]
     num_against: Annotated[int, "Pairs of these that support the other."]
     ambiguous: Annotated[
@@ -103,6 +106,8 @@ class SecondOpinion(Record):
             parts.append(f"{where}, but at least half as much evidence is for another place or rotation")
         percent = rounded(100.0 * self.usual, digits=2) if self.usual > _LEAST_TOLD else "less than 0.001"
         usual = f"positions differ by {percent} % of their spread, median"
+        if self.wrong or self.undecided:
+            usual += f", and at most by {rounded(100.0 * self.farthest, digits=2)} %"
         if self.has_nothing_in_common:
             return f"{self.num_common} cameras have nothing in common with their places {by} ({usual})"
         told = "; ".join(parts) or f"{self.num_common} cameras are in the same place {by}"
@@ -147,6 +152,7 @@ def compare_models(
         usual=usual,
         wrong=images.names_of(mine[wrong]),
         undecided=images.names_of(mine[undecided]),
+        farthest=float(np.max(distances, where=wrong | undecided, initial=0.0)),
         confirmed=frozenset(images.names_of(mine[alike & ~doubted[theirs] & (usual <= _FAR)])),
         num_for=num_for,
         num_against=num_against,

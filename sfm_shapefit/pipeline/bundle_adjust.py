@@ -22,6 +22,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.executors import Crew
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.files.colmap.images import images_of
+from sfm_shapefit.files.colmap.model import ModelSource, read_model
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays
 from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
 from sfm_shapefit.files.colmap.reconstructions import arrays_of, moved_reconstruction
@@ -35,8 +36,6 @@ _WITHIN_95 = 1.96  # standard deviations; between them on either side lie 95 % o
 
 if TYPE_CHECKING:
     import pycolmap
-
-    from sfm_shapefit.files.colmap.model import HoldsModel
 
 
 class Length(NamedTuple):
@@ -115,7 +114,7 @@ class AdjustedModel(Displayed):
 
 
 def bundle_adjust(
-    reconstruction: "pycolmap.Reconstruction | HoldsModel",
+    reconstruction: ModelSource,
     options: AdjustmentOptions | None = None,
     *,
     rotation_sigma_deg: float | None = None,
@@ -133,7 +132,7 @@ def bundle_adjust(
     sensors. Lenses of all models but EQUIRECTANGULAR may be free.
 
     Args:
-        reconstruction: the start, or a result that has it; it is not changed.
+        reconstruction: the start, a result that has it, or a model folder; it is not changed.
         options: settings, see `help(AdjustmentOptions)`; defaults if None.
         rotation_sigma_deg: standard deviation, about each axis, of the rotations that the model has; they
             pull by it. None: they do not.
@@ -142,11 +141,10 @@ def bundle_adjust(
         **overrides: single options by name.
 
     Raises:
-        InputError: if no posed image observes a point, or a number is impossible.
+        InputError: if the model cannot be used, no posed image observes a point, or a number is impossible.
     """
     options = merge_options(options, AdjustmentOptions, overrides)
-    model = reconstruction.reconstruction if hasattr(reconstruction, "reconstruction") else reconstruction
-    read, _ = arrays_of(model)
+    read = read_model(reconstruction).arrays
     images, points, tracks = read_bundle(read)
     triangulated = TriangulatedPoints.of_tracks(tracks, points.xyz)
     views, given = views_of(images), GivenPoses(fixed=np.isin(images.frames.ids, sorted(fixed_frames)))

@@ -1,12 +1,13 @@
 """What other pipelines call: `global_mapping`, as pycolmap has it, and `average_database`."""
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.base.clock import Clock, Progress
-from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.files.colmap.seed import SeededModel
@@ -21,15 +22,36 @@ if TYPE_CHECKING:
     import pycolmap
     from distributed import Client
 
+    _PycolmapOptions = pycolmap.GlobalPipelineOptions | pycolmap.IncrementalPipelineOptions
+
 _TAKEN = {"num_threads": "threads", "min_num_matches": "min_matches", "min_model_size": "min_model_size"}
 """Options of pycolmap that have a counterpart here, and its name."""
+
+_WITHOUT_EFFECT = {
+    "num_threads",
+    "random_seed",
+    "use_gpu",
+    "gpu_index",
+    "image_path",
+    "refine_sensor_from_rig",
+}
+"""Options of pycolmap, wherever they stand, whose other value asks for what is so here anyway."""
+
+_NOT_TAKEN = {
+    "input_path": "no model is continued; `locate(model, database, fix='solved')` adds images to one",
+    "next_image_callback": "images are placed all at once; `map_database` takes a `progress` function",
+    "initial_image_pair_callback": "no first pair is chosen; `map_database` takes a `progress` function",
+    "cancellation_token": "leave it out; an interrupt (Ctrl-C) ends the run",
+}
+"""Arguments of `pycolmap.incremental_mapping` that have no counterpart, and what to do instead."""
 
 
 def global_mapping(
     database_path: Path | str,
     image_path: Path | str,
     output_path: Path | str,
-    options: "MapOptions | pycolmap.GlobalPipelineOptions | Mapping[str, Any] | None" = None,
+    options: "MapOptions | _PycolmapOptions | Mapping[str, Any] | None" = None,
+    **others: object,
 ) -> "dict[int, pycolmap.Reconstruction]":
     """Map a database as `pycolmap.global_mapping` and `pycolmap.incremental_mapping` do; one import changes.
 
@@ -42,16 +64,27 @@ def global_mapping(
         output_path: folder for the models 0, 1, ..., each with its report.html; empty, new, or an earlier
             output, which is replaced.
         options: `MapOptions`, or a mapping of some of them; defaults if None. From pycolmap's options
-            `num_threads`, `min_num_matches` and `min_model_size` are taken; the others have no counterpart.
+            `num_threads`, `min_num_matches` and `min_model_size` are taken; where bundle adjustment is not to
+            refine focal lengths, intrinsics are "held", distortion too, and where only extra parameters stay,
+            "focal". Seeds, GPUs, threads of single stages and sensors that stay in their rigs need nothing.
+            A warning names all others that are not pycolmap's defaults: they have no effect.
+        **others: further arguments of `pycolmap.incremental_mapping`, which must be empty.
 
     Returns:
         The models by their numbers, the one with most cameras first; `map_database` returns them with the
         evidence for each.
 
     Raises:
-        InputError: if the database cannot be used, or the output would replace something else.
+        InputError: if the database cannot be used, the output would replace something else, or pycolmap's
+            options choose images by `image_names`.
         UnsolvableError: if no component of three images or more can be placed.
+        TypeError: for options of another function, or an argument that is not taken.
     """
+    for name, value in others.items():
+        if value or name not in _NOT_TAKEN:
+            raise TypeError(
+                f"global_mapping takes no {name}: {_NOT_TAKEN.get(name, 'it has no such argument')}"
+            )
     if isinstance(options, Mapping):
         options = MapOptions(**options)
     elif options is not None and not isinstance(options, MapOptions):
@@ -61,15 +94,35 @@ def global_mapping(
     return {number: model.reconstruction for number, model in enumerate(mapped.models)}
 
 
-def _options_of(theirs: "pycolmap.GlobalPipelineOptions") -> MapOptions:
+def _options_of(theirs: "_PycolmapOptions") -> MapOptions:
     """Return the options of pycolmap that have a counterpart, where they are not its defaults."""
-    usual = type(theirs)()
-    values = {
-        ours: getattr(theirs, name)
-        for name, ours in _TAKEN.items()
-        if getattr(theirs, name, None) != getattr(usual, name, None)
-    }
+    if type(theirs).__name__ not in ("GlobalPipelineOptions", "IncrementalPipelineOptions"):
+        raise TypeError(
+            "options must be MapOptions(...), a mapping of some, or pycolmap's GlobalPipelineOptions or "
+            f"IncrementalPipelineOptions, got a {type(theirs).__name__}"
+        )
+    usual = dict(_single_values(type(theirs)().todict()))
+    changed = {name: one for name, one in _single_values(theirs.todict()) if str(one) != str(usual[name])}
+    if "image_names" in changed:
+        raise InputError("image_names is not taken: all images are mapped; give a database of these alone")
+    values = {ours: changed.pop(name) for name, ours in _TAKEN.items() if name in changed}
+    ends = {name: name.rpartition(".")[2].removeprefix("ba_") for name in changed}
+    kept = {"refine_focal_length", "refine_extra_params"} & {*ends.values()}
+    if kept:
+        values["intrinsics"] = "held" if "refine_focal_length" in kept else "focal"
+    lost = [f"{name}={changed[name]}" for name, end in ends.items() if end not in _WITHOUT_EFFECT | kept]
+    if lost:
+        said = f"these options of pycolmap have no effect: {', '.join(lost)}"
+        warnings.warn(f"{said}; docs/coming_from.md says what there is instead", stacklevel=3)
     return MapOptions(**values)
+
+
+def _single_values(options: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in options.items():
+        if isinstance(value, Mapping):
+            yield from _single_values(value, f"{within}{name}.")
+        else:
+            yield within + name, value
 
 
 def average_database(

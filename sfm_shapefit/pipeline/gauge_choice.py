@@ -99,9 +99,9 @@ def _bring_to_scale_bars(state: ModelState, known: ScaleBars) -> ModelState:
     measured = measure_bars(state.images, known, state.estimate, state.inputs.options.structure)
     fit = fit_scale_bars(known, measured.found)
     if fit is not None and not (is_known or state.gauge.scale == "control points"):
-        middle = state.images.centers[state.images.is_posed].mean(axis=0)
+        centers = state.images.centers[state.images.is_posed]
         statement = f"scale bars: {known.statement}; {fit.statement}"
-        state = state.moved(*resized_gauge(state.gauge, middle, fit.scale, fit.sigma, statement))
+        state = state.moved(*resized_gauge(state.gauge, centers, fit.scale, fit.sigma, statement))
         measured = measured.in_scale_of(fit)
     else:
         measured = measured._replace(found=measured.found.in_scale(scale_errors(state)))

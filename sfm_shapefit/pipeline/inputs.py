@@ -212,7 +212,7 @@ def choose_inputs(
     if path is None:
         if source != "auto":
             raise InputError(f"directions from {source} need a database; give one (database=FILE)")
-        statement = "the model's own tracks; no database.db was given or found beside the model"
+        statement = "the model's own tracks, which cannot show a fold; no database.db was found beside it"
         return Inputs(folder=folder, database=None, statement=statement)
     beside = " (found beside the model)" if database is None else ""
     statement = f"inlier matches of {path}{beside}"

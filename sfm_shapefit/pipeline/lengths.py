@@ -162,12 +162,19 @@ def evaluate_lengths(
     datum = model_datum(model)
     axes = Axes(unit="m" if datum else "units", has_scale=scale_sigma is not None, has_up=datum is not None)
     scale = ScaleErrors(np.zeros(_num_draws(estimate)), scale_sigma or 0.0)
+    lengths = list(_between(seen, scale, axes, ends))
+    known = {(one.first, one.second) for one in lengths}
+    unknown = [f"{first} and {second}" for first, second in ends if (str(first), str(second)) not in known]
     return LengthsFacts(
         usual=length_between(images, points, estimate, scale, axes),
-        lengths=list(_between(seen, scale, axes, ends)),
+        lengths=lengths,
         scale_bars=bars.rows() if bars else (),
         scale_sigma=scale_sigma,
-        warnings=[*posed.notes, *(bars.warnings() if bars else ())],
+        warnings=[
+            *posed.notes,
+            *(bars.warnings() if bars else ()),
+            *(f"how well the distance of {ends} is known is not known; choose others" for ends in unknown),
+        ],
     )
 
 
@@ -213,18 +220,14 @@ def _between(
         assert estimate is not None
         rows = np.array([_row_of(images, points, end) for end in (first, second)])
         if rows[0] == rows[1]:
-            raise InputError(f"{first} and {second} are the same place; name two places for a length")
+            raise InputError(f"{first} and {second} are one place, and no length; name two")
         own, chosen = rows < images.num_images, rows - images.num_images
         cameras = errors_of_images(images, draws_at(estimate, images))
         places = cameras.followed_by(_errors_of(images, points, estimate, chosen[~own]))
         rows[~own] = images.num_images + np.arange(np.sum(~own))
         apart = places.apart(rows[None]).in_scale(scale)
-        found = tell_length(apart, float(apart.lengths[0]), axes)
-        if found is None:
-            raise UnsolvableError(
-                f"nothing is known of the error of the distance from {first} to {second}; leave it out"
-            )
-        yield LengthBetween(first=str(first), second=str(second), length=found)
+        if found := tell_length(apart, float(apart.lengths[0]), axes):
+            yield LengthBetween(first=str(first), second=str(second), length=found)
 
 
 def _row_of(images: Images, points: Points, end: str | int) -> int:

@@ -260,11 +260,8 @@ def _choose_scale(group: JoinedGroup, first: Gauge, join_inputs: JoinInputs) -> 
         known = join_inputs.bars
         fit = known and fit_scale_bars(known, compare_bars(images, known, None, None).found)
         if known and fit:
-            middle, said = (
-                images.centers.mean(axis=0),
-                f"scale bars: {known.statement}; {fit.statement}",
-            )
-            motion, gauge = resized_gauge(first, middle, fit.scale, fit.sigma, said)
+            said = f"scale bars: {known.statement}; {fit.statement}"
+            motion, gauge = resized_gauge(first, images.centers, fit.scale, fit.sigma, said)
             return gauge, _moved(group, motion)
         try:
             if distances:

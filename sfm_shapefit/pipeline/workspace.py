@@ -121,7 +121,7 @@ def workspace(
                 count = "only one" if flats else "no"
                 raise InputError(
                     f"{images} has {count} picture of the model ({name}: {why}); give the folder of those "
-                    "that it was made of"
+                    f"that it was made of{', and their masks' if masks else ''}"
                 )
         with clock("model"):
             colored, _ = color_model(leveled, PictureFolder(Path(images), clock.threads))

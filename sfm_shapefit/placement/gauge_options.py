@@ -7,6 +7,7 @@ from sfm_shapefit.base.settings import Settings, explained, option
 
 Scale = Literal["auto", "input", "unit"]
 KnownDistance = tuple[str, str, float]
+_LONGEST = 1e30  # units; squares of squares of longer ones overflow, and those of 1 over it vanish
 
 
 @explained
@@ -53,5 +54,6 @@ def _check_distance(known: Any) -> None:
     fits = zip(parts, (str, str, int | float), strict=False)
     if len(parts) != 3 or not all(isinstance(part, kind) for part, kind in fits):
         raise ValueError(f"known_distance must be two image names and a number, got {known!r}")
-    if not 0.0 < known[2] < float("inf") or known[0] == known[1]:
-        raise ValueError(f"known_distance must be positive, of two different images, got {known!r}")
+    if not 1.0 / _LONGEST <= known[2] <= _LONGEST or known[0] == known[1]:
+        span = f"from {1.0 / _LONGEST:g} to {_LONGEST:g}"
+        raise ValueError(f"known_distance must be positive, {span}, of two different images, got {known!r}")

@@ -135,13 +135,20 @@ def gauge_of_distances(names: Sequence[str], locations: FloatArray, known: Seque
 
 
 def resized_gauge(
-    before: Gauge, middle: FloatArray, scale: float, sigma: float, statement: str
+    before: Gauge, centers: FloatArray, scale: float, sigma: float, statement: str
 ) -> tuple[Similarity, Gauge]:
-    """Return the motion that gives a model another scale, its middle (3,) where it is, and the gauge then.
+    """Return the motion that gives a model of centers (n, 3) another scale, and the gauge then.
 
-    The scale is that of scale bars, and known to `sigma` of itself.
+    Their mean stays. The scale is that of scale bars, and known to `sigma` of itself. InputError if the
+    centers are one point then, to rounding.
     """
-    motion = Similarity(scale=scale, rotation=np.eye(3), translation=(1.0 - scale) * middle)
+    translation = (1.0 - scale) * centers.mean(axis=0)
+    motion = Similarity(scale=scale, rotation=np.eye(3), translation=translation)
+    if coincide(motion.apply(centers)):
+        raise InputError(
+            f"the scale bars make the model {scale:.2g} times as large, so small that its cameras coincide; "
+            "give lengths and standard deviations in a smaller unit"
+        )
     axes = np.eye(3) if before.axes is None else before.axes
     rest = f"origin and axes: those of {SETS_SCALE[before.scale]}"
     if before.scale in ("unit", "distance"):

@@ -119,10 +119,10 @@ def _ground(points: FloatArray, centers: FloatArray, up: FloatArray) -> tuple[Fl
     with np.errstate(invalid="ignore"):
         normals = normalized(normals) * np.sign(normals @ up)[:, None]
         steep = ~(normals @ up >= np.cos(_STEEPEST))
-    heights, thickness = normals @ points.T, _THICKNESS * median_spread(points)
-    levels = np.sum(normals * triples[:, 0], axis=1)
-    steep |= np.median(normals @ centers.T, axis=1) < levels
-    counts = np.where(steep, 0, (np.abs(heights - levels[:, None]) <= thickness).sum(axis=1))
+        heights, thickness = normals @ points.T, _THICKNESS * median_spread(points)
+        levels = np.sum(normals * triples[:, 0], axis=1)
+        steep |= np.median(normals @ centers.T, axis=1) < levels
+        counts = np.where(steep, 0, (np.abs(heights - levels[:, None]) <= thickness).sum(axis=1))
     best = int(np.argmax(counts))
     share = float(counts[best]) / len(points)
     if share < _GROUND_SHARE:

@@ -150,6 +150,8 @@ REFUSED = [
     (LocateOptions, {"rotations": -1.0}, "rotations must lie between"),
     (LocateOptions, {"rotations": "exact"}, "rotations must be one of auto, held, free or a number"),
     (LocateOptions, {"known_distance": ("a", "b", -1.0)}, "must be positive"),
+    (LocateOptions, {"known_distance": ("a", "b", 1e200)}, r"positive, from 1e-30 to 1e\+30, of two"),
+    (LocateOptions, {"known_distance": ("a", "b", 1e-200)}, r"positive, from 1e-30 to 1e\+30, of two"),
     (LocateOptions, {"known_distance": ("a", "a", 1.0)}, "two different images"),
     (LocateOptions, {"known_distance": ("a", "b")}, "two image names and a number"),
     (LocateOptions, {"known_distance": 3.0}, "known_distance must be of type tuple"),

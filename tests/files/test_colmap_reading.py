@@ -269,6 +269,7 @@ BROKEN_RECORDS = {
     "NaN pixel": (_set("images", 1, 4, [(5.0, NAN, 7)]), "image 2 has a point whose coordinates are not"),
     "NaN point": (_set("points3D", 0, 1, (0.0, NAN, 1.0)), "3D point 7 has coordinates that are not finite"),
     "infinite point": (_set("points3D", 0, 1, (-INF, 0.0, 1.0)), "3D point 7 has coordinates that are not"),
+    "huge point": (_set("points3D", 0, 1, (0.0, 1e101, 1.0)), "3D point 7 has coordinates that are not"),
     "point twice": (_append("points3D", [7, (0.0, 0.0, 1.0), []]), "3D point 7 appears twice"),
     "rig of no camera": (_set("rigs", 0, 1, [(0, 4)]), "rig 1 refers to camera 4"),
     "rig twice": (_append("rigs", [1, [(0, 1)]]), "rig 1 appears twice"),

@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import shutil
 
 import numpy as np
 import pycolmap
@@ -15,7 +16,7 @@ from tests.scenes import BUNDLED, COURTYARD, PHOTOGRAPHED, RING
 
 def test_global_mapping_is_called_and_answers_as_pycolmaps(tmp_path):
     theirs = re.findall(r"(\w+): ", pycolmap.global_mapping.__doc__.partition(" -> ")[0])
-    assert list(inspect.signature(sfm_shapefit.global_mapping).parameters) == theirs
+    assert list(inspect.signature(sfm_shapefit.global_mapping).parameters) == [*theirs, "others"]
     out = tmp_path / "models"
     out.mkdir()  # as scripts do for pycolmap
     models = sfm_shapefit.global_mapping(PHOTOGRAPHED / "database.db", "", out)
@@ -31,6 +32,49 @@ def test_global_mapping_is_called_and_answers_as_pycolmaps(tmp_path):
     assert pycolmap.Reconstruction(out / "0").num_reg_images() == 8
     with pytest.raises(TypeError, match="did you mean min_trust"):
         sfm_shapefit.global_mapping(RING / "database.db", "", out, {"min_trsut": 0.5})
+
+
+def test_lenses_that_pycolmap_is_to_keep_are_kept_and_options_without_counterpart_are_named(tmp_path):
+    guessed = tmp_path / "database.db"
+    shutil.copyfile(RING / "database.db", guessed)
+    with pycolmap.Database.open(guessed) as database:
+        for camera in database.read_all_cameras():
+            camera.has_prior_focal_length, camera.params = False, camera.params * [1.02, 1.02, 1.0, 1.0]
+            database.update_camera(camera)
+        focal = camera.focal_length_x
+    globally, grown = pycolmap.GlobalPipelineOptions(), pycolmap.IncrementalPipelineOptions()
+    globally.random_seed, globally.mapper.bundle_adjustment.ceres.use_gpu = 3, False  # need nothing here
+    globally.mapper.bundle_adjustment.refine_focal_length = False
+    grown.ba_refine_focal_length = grown.ba_refine_extra_params = grown.multiple_models = False
+    models = [sfm_shapefit.global_mapping(guessed, "", tmp_path / "free")]
+    models.append(sfm_shapefit.global_mapping(guessed, "", tmp_path / "global", globally))
+    with pytest.warns(UserWarning, match=r"have no effect: multiple_models=False; docs/coming_from"):
+        models.append(sfm_shapefit.global_mapping(guessed, "", tmp_path / "grown", grown, input_path=""))
+    free, *held = [next(iter(model[0].cameras.values())).focal_length_x for model in models]
+    assert held == [focal, focal]
+    assert abs(free - focal) > 0.01 * focal
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "others", "message"),
+    [
+        (InputError, pycolmap.GlobalPipelineOptions(image_names=["a.jpg"]), {}, "image_names is not taken"),
+        (
+            TypeError,
+            pycolmap.BundleAdjustmentOptions(),
+            {},
+            "options must be .*got a BundleAdjustmentOptions",
+        ),
+        (TypeError, sfm_shapefit.LocateOptions(), {}, "options must be MapOptions.*got a LocateOptions"),
+        (TypeError, None, {"input_path": "sparse"}, "takes no input_path: no model is continued; `locate"),
+        (TypeError, None, {"next_image_callback": print}, "takes no next_image_callback: .*`progress`"),
+        (TypeError, None, {"ouput": None}, "takes no ouput: it has no such argument"),
+    ],
+)
+def test_options_and_arguments_that_would_be_ignored_are_refused(tmp_path, kind, options, others, message):
+    with pytest.raises(kind, match=message):
+        sfm_shapefit.global_mapping(RING / "database.db", "", tmp_path / "out", options, **others)
+    assert not (tmp_path / "out").exists()
 
 
 def test_average_database_is_a_model_with_rotations_alone():
@@ -55,6 +99,7 @@ def test_a_result_serves_wherever_a_model_does(tmp_path, ring_located, ring_mapp
     assert sfm_shapefit.inspect(found).num_images == 8
     assert sfm_shapefit.convert(found, tmp_path / "poses.csv") == tmp_path / "poses.csv"
     assert len(sfm_shapefit.bundle_adjust(found).frame_ids) == 8
+    assert len(sfm_shapefit.bundle_adjust(RING / "sparse/0").frame_ids) == 8
     assert sfm_shapefit.locate(found).reconstruction.num_reg_images() == 8
     assert sfm_shapefit.evaluate(mapped, found).position.max < 1e-4
     assert sfm_shapefit.evaluate(mapped.models[0], found).position.max < 1e-4

@@ -204,11 +204,12 @@ GOOD = [line(image, end=end) for end in ("left", "right") for image in ("0001.jp
         ([*GOOD, "2 0.001 100 100 0003.jpg B0"], "line 6: expected the length of a bar"),
         ([*GOOD, line(bar="B1", numbers="0 0.001 1 1")], "line 6: a bar has a length above 0, and a"),
         ([*GOOD, line(bar="B1", numbers="2 0 1 1")], "below the length, in the output's units; got 2 and 0"),
+        ([*GOOD, line(bar="B1", numbers="2 1e-31 1 1")], "a standard deviation above 1e-30 and below"),
         ([*GOOD, line(bar="B1", numbers="nan 1 1 1")], "line 6: numbers must be finite"),
         ([*GOOD, line("0003.jpg", numbers="3 0.001 1 1")], "line 6: B0 has other numbers than in line 2"),
         ([*GOOD, f"{line('0003.jpg')} check"], "line 6: B0 has another role than in line 2"),
         ([*GOOD, GOOD[0]], "line 6: B0 left is marked twice in 0001.jpg; keep one of its marks"),
-        (GOOD[:2], "line 2: B0 has 1 ends, left; a scale bar has two"),
+        (GOOD[:2], "line 2: B0 has 1 end, left; a scale bar has two"),
         ([*GOOD, line(end="top")], "line 2: B0 has 3 ends, left, right, top; a scale bar has two"),
         (GOOD[:3], "line 4: the end right of B0 is marked in one image; mark it in another"),
         ([one.replace(".jpg", ".png") for one in GOOD], "has no mark in an image of the model, such"),
@@ -225,6 +226,33 @@ def test_a_file_that_cannot_serve_is_refused_by_its_line(ring, tmp_path, lines, 
         read_scale_bars(path, read_model(ring).images)
     assert said in str(refused.value)
     assert str(refused.value).startswith(str(path))
+
+
+def test_bars_that_make_a_model_one_point_are_refused(ring, tmp_path):
+    short = [" ".join(("1e-13", "1e-16", *one.split()[2:])) for one in lines_of(ring)]
+    with pytest.raises(InputError, match=r"bars make the model .*e-1. times as large, so small that its cam"):
+        sfm_shapefit.locate(ring, RING / "database.db", scale_bars=written(tmp_path, short))
+
+
+def test_lengths_that_are_none_are_told(ring):
+    with pytest.raises(InputError, match=r"0001.jpg and 0001.jpg are one place, and no length"):
+        sfm_shapefit.evaluate_lengths(ring, [("0001.jpg", "0001.jpg")])
+    few = pycolmap.Reconstruction(ring)
+    for point in sorted(few.points3D)[1:]:
+        few.delete_point3D(point)
+    found = sfm_shapefit.evaluate_lengths(few, [("0001.jpg", "0002.jpg")])
+    assert found.lengths == []
+    assert found.warnings[-1].startswith(
+        "how well the distance of 0001.jpg and 0002.jpg is known is not known"
+    )
+
+
+def test_a_model_whose_cameras_stand_in_one_place_is_told_of_without_errors(ring):
+    turned = pycolmap.Reconstruction(ring)
+    for image in turned.images.values():
+        turn = image.cam_from_world().rotation
+        image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(turn, np.zeros(3)))
+    assert sfm_shapefit.evaluate_lengths(turned).usual is None
 
 
 def test_a_bar_whose_marks_do_not_agree_is_named(ring, tmp_path):
@@ -251,7 +279,6 @@ def test_evaluate_and_check_compare_with_bars_and_tell_lengths(ring, tmp_path):
     command = ["check", model, "--scale-bars", bars, "--json", "--no-second-opinion"]
     assert len(json.loads(CliRunner().invoke(app, command).stdout)["scale_bars"]) == 4
     for more, said, code in (
-        (["--length", "0001.jpg", "0001.jpg"], "0001.jpg and 0001.jpg are the same place", 3),
         (["--length", "0001.jpg", "nobody.jpg"], "no posed image nobody.jpg", 3),
         ([model, "--length", "0001.jpg", "0002.jpg"], "are of MODEL alone; leave REF out", 2),
     ):

@@ -197,6 +197,7 @@ def test_masks_that_are_none_or_of_another_size_are_told(tmp_path):
     cv2.imwrite(str(masks / "0.png"), np.zeros((120, 160), np.uint8))
     cv2.imwrite(str(masks / "1.png.png"), np.zeros((60, 80), np.uint8))
     (masks / "2.png").write_text("no picture")
+    (masks / "3.png.png").symlink_to("3.png.png")  # round in a circle; as if there were none
     said = run(*typed, code=0).stdout
     assert "1 image is left out (mask of another size than its camera's): 1.png" in said
     assert "1 image is left out (unreadable mask): 2.png" in said
@@ -327,5 +328,10 @@ def test_a_wrong_folder_or_small_pictures_are_refused_and_nothing_is_written(tmp
     for file in sky.images.iterdir():
         cv2.imwrite(str(file), cv2.imread(str(file))[::2, ::2])
     with pytest.raises(InputError, match="picture of another size than its camera's"):
+        sfm_shapefit.workspace(sky.model, sky.images, tmp_path / "out")
+    with pytest.raises(InputError, match="give the folder of those that it was made of, and their masks"):
+        sfm_shapefit.workspace(sky.model, sky.images, tmp_path / "out", mask_path=str(sky.images))
+    sky.model.camera(1).width = sky.model.camera(1).height = 0
+    with pytest.raises(InputError, match="camera 1 is of 0 x 0 pixels; give it the size of its pictures"):
         sfm_shapefit.workspace(sky.model, sky.images, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -13,12 +13,12 @@ import numpy as np
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import tangent_bases
 from sfm_shapefit.files.colmap.lenses import rays_of
+from sfm_shapefit.files.colmap.position_table import LARGEST
 from sfm_shapefit.files.lines import is_number, text_of
 from sfm_shapefit.scene.given import MarkedViews, Marks
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
 
-_LARGEST = 1e30  # units; squares of squares of larger coordinates overflow
 _CHECK_PREFIX, _CHECK_WORD = "chk-", "check"
 _OUTSIDE_PX = 1.0  # pixels beyond the edge of a picture; programs count from the middle or edge of a pixel
 
@@ -68,7 +68,7 @@ def read_marks(
         if len(cells) < least or not all(map(is_number, numbers)):
             raise InputError(f"{path}, line {number}: expected {expected}")
         values = np.array([float(cell) for cell in numbers])
-        if not (np.abs(values) <= _LARGEST).all():
+        if not (np.abs(values) <= LARGEST).all():
             raise InputError(f"{path}, line {number}: numbers must be finite, and all of them known")
         u, v = values[count:].tolist()
         marks.append(Mark(number, tuple(cells[:count]), (u, v), cells[count + 2], tuple(cells[count + 3 :])))

@@ -25,15 +25,12 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import counted, counted_are, first_of
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.lenses import focal_lengths
-from sfm_shapefit.files.colmap.model_arrays import ModelArrays, RigRecord
+from sfm_shapefit.files.colmap.model_arrays import LARGEST_COORDINATE, ModelArrays, RigRecord
 from sfm_shapefit.files.colmap.read_binary import read_folder
 from sfm_shapefit.files.colmap.reconstructions import arrays_of, reconstruction_of
 from sfm_shapefit.files.norms import are_off, say_normalized
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import names_among
-
-# Sums of squares of larger coordinates overflow; these count as not finite.
-_LARGEST_COORDINATE = 1e100
 
 
 class HoldsModel(Protocol):
@@ -187,7 +184,7 @@ def _posed_model(label: str, model: ColmapModel) -> ColmapModel:
         raise InputError(f"{label} has two images of the name {repeated}; rename one")
     translations = arrays.camera_poses()[arrays.images.rows(images.ids), 4:]
     with np.errstate(invalid="ignore"):
-        absurd = (np.abs(translations) > _LARGEST_COORDINATE).any(axis=1)
+        absurd = (np.abs(translations) > LARGEST_COORDINATE).any(axis=1)
     if absurd.any():
         raise InputError(f"{label}: the position of image {images.ids[np.argmax(absurd)]} is not finite")
     for lens in images.lenses:

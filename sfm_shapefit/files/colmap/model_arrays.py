@@ -21,6 +21,8 @@ CAMERA_SENSOR = 0  # type of a sensor; COLMAP's number for cameras
 AT_ONCE = 2**14
 """Points or keypoints that are looked at together; all those of 10,000 images take 200 MB."""
 ORIGIN = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # a pose; that of the world itself
+LARGEST_COORDINATE = 1e100
+"""Units; sums of squares of larger coordinates overflow, and these count as not finite."""
 FEWEST_IMAGES = 2  # observations; COLMAP removes a point that loses one of so many
 
 Sensor = tuple[int, int]

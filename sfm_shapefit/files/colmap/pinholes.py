@@ -97,7 +97,14 @@ class Pinhole(NamedTuple):
 
 
 def pinholes_of(camera: pycolmap.Camera, longest_px: int = -1) -> list[Pinhole]:
-    """Return what pictures through a lens become, with longer sides of at most so many pixels, -1 for any."""
+    """Return what pictures through a lens become, with longer sides of at most so many pixels, -1 for any.
+
+    Raises:
+        InputError: if the size of the pictures is not known.
+    """
+    if not (camera.width and camera.height):
+        size = f"{camera.width} x {camera.height} pixels"
+        raise InputError(f"camera {camera.camera_id} is of {size}; give it the size of its pictures")
     return [pinhole.within(longest_px) for pinhole in _pinholes_of(camera)]
 
 

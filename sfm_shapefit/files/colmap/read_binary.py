@@ -49,6 +49,7 @@ from sfm_shapefit.files.colmap.camera_variants import (
 )
 from sfm_shapefit.files.colmap.model_arrays import (
     CAMERA_SENSOR,
+    LARGEST_COORDINATE,
     FrameRecords,
     ImageRecords,
     ModelArrays,
@@ -422,7 +423,7 @@ def _with_points(files: ModelFiles, model: ModelArrays) -> ModelArrays:
     called = files.called_as("points3D")
     contradiction = ""
     for heads, elements in model.point_blocks():
-        is_finite = np.isfinite(heads["xyz"]).all(axis=1)
+        is_finite = (np.abs(heads["xyz"]) <= LARGEST_COORDINATE).all(axis=1)  # false for NaN
         if not is_finite.all():
             point = heads["id"][~is_finite][0]
             raise InputError(f"{called}: 3D point {point} has coordinates that are not finite")

@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.files.colmap.marks import Mark, lines_of, marks_in, read_marks
+from sfm_shapefit.files.colmap.position_table import LARGEST
 from sfm_shapefit.scene.given import ScaleBars
 from sfm_shapefit.scene.images import Images
 
@@ -61,10 +63,10 @@ def read_scale_bars(path: Path, images: Images) -> ScaleBars:
 def _refuse_contradiction(path: Path, mark: Mark, first: Mark) -> None:
     """Refuse a mark whose length is none, or is not that of the first mark of its bar."""
     (length, sigma), where = mark.known, f"{path}, line {mark.number}: "
-    if not 0.0 < sigma < length:
+    if not 1.0 / LARGEST <= sigma < length:
         raise InputError(
-            f"{where}a bar has a length above 0, and a standard deviation above 0 and below the length, in "
-            f"the output's units; got {length:g} and {sigma:g}"
+            f"{where}a bar has a length above 0, and a standard deviation above {1.0 / LARGEST:g} and below "
+            f"the length, in the output's units; got {length:g} and {sigma:g}"
         )
     if mark.known != first.known or mark.is_check != first.is_check:
         what = "other numbers" if mark.known != first.known else "another role"
@@ -80,9 +82,10 @@ def _ends_of(path: Path, bar: str, marks: list[Mark]) -> list[str]:
     for mark in marks:
         marked.setdefault(mark.names[1], []).append(mark)
     if len(marked) != 2:
+        ends = f"{counted(len(marked), 'end')}, {', '.join(marked)}"
         raise InputError(
-            f"{path}, line {marks[0].number}: {bar} has {len(marked)} ends, {', '.join(marked)}; a scale bar "
-            "has two, told apart by the word after its name"
+            f"{path}, line {marks[0].number}: {bar} has {ends}; a scale bar has two, told apart by the word "
+            "after its name; tabs part words that hold blanks"
         )
     for end, own in marked.items():
         if len({mark.image for mark in own}) < 2:
