@@ -169,6 +169,7 @@ TWICE = [line(k, image) for k in range(4) for image in ("0001.jpg", "0002.jpg")]
         ("EPSG:31468", TWICE, "line 1: the projection 'EPSG:31468' is not one that is converted"),
         ("+proj=utm +zone=32 +ellps=bessel", TWICE, "is not one that is converted"),
         ("WGS84 UTM 61N", TWICE, "is not one that is converted"),
+        ("WGS84 UTM 32N", [one.replace("0.3 0.3", "5e5 1e28") for one in TWICE], "beyond those of UTM"),
         (
             "EPSG:4326",
             [line.replace("0.3 0.3", "11.0 95.0") for line in TWICE],

@@ -21,6 +21,7 @@ _UTM_STRING = re.compile(r".*\+proj=utm\b.*\+zone=(\d{1,2})\b.*")
 _EARTH_SHAPE, _UNITS = re.compile(r"\+(?:ellps|datum)=(\S+)"), re.compile(r"\+units=(\S+)")
 _ZONES = range(1, 61)
 _NAMES_ONE = re.compile(r"(epsg:\d+|wgs84|utm\b|\+proj=|(local|enu)$)")
+_FARTHEST_M = 1e7  # meters; the largest northing of a zone of UTM
 _MUCH_CLOSER = 0.5  # share of the distances from the median; what other turns of longitudes have to save
 
 Projection = Callable[[FloatArray], tuple[FloatArray, bool]]
@@ -37,7 +38,7 @@ def projection_named(line: str) -> Projection:
     """Return the projection that a line names.
 
     Raises:
-        ValueError: if it is none that is converted.
+        ValueError: if it is none that is converted; what is returned raises it for coordinates out of range.
     """
     named = _plain(line)
     if named in _LOCAL:
@@ -46,14 +47,18 @@ def projection_named(line: str) -> Projection:
         return lambda xyz: (xyz[:, [1, 0, 2]], True)
     zone, is_north = _zone(named)
     if zone in _ZONES:
-        return lambda xyz: (
-            np.asarray(earth().utm_to_ellipsoid(np.ascontiguousarray(xyz), zone, is_north)),
-            True,
-        )
+        return lambda xyz: (_from_zone(xyz, zone, is_north), True)
     raise ValueError(
         f"the projection {line.strip()!r} is not one that is converted; give coordinates in EPSG:4326 "
         "(longitude, latitude, altitude), in a zone as WGS84 UTM 32N, or metric ones after the line local"
     )
+
+
+def _from_zone(xyz: FloatArray, zone: int, is_north: bool) -> FloatArray:
+    """Return latitudes, longitudes and altitudes (k, 3) of eastings, northings and altitudes in meters."""
+    if np.abs(xyz[:, :2]).max(initial=0.0) > _FARTHEST_M:
+        raise ValueError("an easting or northing is beyond those of UTM; give meters, easting first")
+    return np.asarray(earth().utm_to_ellipsoid(np.ascontiguousarray(xyz), zone, is_north))
 
 
 def unwrapped(longitudes: FloatArray) -> FloatArray:
