@@ -182,6 +182,36 @@ def test_those_who_come_from_colmap_are_told_of_flags_that_there_are():
     assert set(re.findall(r"sfm-shapefit ([a-z-]+)", page[0])) <= commands
 
 
+def answered(*typed: str) -> tuple[set[str], bool]:
+    """Return the flags and keys, or else the command, that the program names, and whether there are any."""
+    said = " ".join(run(*typed, code=2).stderr.split()).partition(" is COLMAP's")[2]
+    assert said, typed
+    names = {*re.findall(r"--[a-z-]+|\w+(?= = )", said)} - {"--config"}
+    command = set(re.findall(r"sfm-shapefit ([a-z]+)", said))
+    return names or command, not said.endswith("leave it out")
+
+
+def test_the_program_answers_colmaps_flags_and_commands_as_the_page_does():
+    page = TEXTS[ROOT / "docs/coming_from.md"].split("## Flags")
+    commands, flags = ([line.split("|")[1:3] for line in part.splitlines() if "|" in line] for part in page)
+    asked = 0
+    for theirs, ours in commands:
+        if "`colmap " in theirs:
+            for name in set(re.findall(r"`(?:colmap )?(\w+)(?: --[^`]*)?`", theirs)) - {"evo_ape"}:
+                named, is_there = answered(name)
+                asked += 1
+                assert is_there, name
+                assert named, name
+                assert named <= set(re.findall(r"[\w-]+", ours)), name
+    for theirs, ours in flags:
+        for name in re.findall(r"`(\w+\*?)`", theirs):
+            named, is_there = answered("map", "a", "b", f"--Mapper.{name.replace('*', 'x')}", "0")
+            asked += 1
+            assert is_there == bool(named) == ("none:" not in ours), name
+            assert named <= set(re.findall(r"[\w-]+", ours)), name
+    assert asked > 45
+
+
 def strings_of(tree: ast.AST) -> list[str]:
     """Return the strings of a module, with a star where they are filled in."""
     filled = [node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)]

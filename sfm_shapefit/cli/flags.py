@@ -214,7 +214,7 @@ class GroupedCommand(TyperCommand):
                 ctx.fail(f"{flag} is a key of --config: {name} = ...")
             if others := _commands_with(name):
                 ctx.fail(f"{flag} is an option of {others}")
-            if answer := answer_for(flag, known):
+            if answer := answer_for(flag, known | key_names):
                 ctx.fail(answer)
 
 

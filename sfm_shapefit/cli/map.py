@@ -90,7 +90,8 @@ def _database_to_make(source: Path, target: Path, given: dict[str, Any]) -> Path
 
     if source.is_dir() and database_beside(source) is None:
         return target / DATABASE_NAMES[0]
-    if told := [name for name in homes_of(MatchingOptions) if given.get(name) is not None]:
+    told = [name for name in homes_of(MatchingOptions) if given.get(name) is not None]
+    if told and source.exists():  # a path that is not there is refused where the database is opened
         raise typer.BadParameter(
             f"--{told[0].replace('_', '-')} is for a folder of images, but {source} is a database already"
         )

@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from sfm_shapefit import __version__
-from sfm_shapefit.cli.colmap_names import COMMANDS
+from sfm_shapefit.cli.colmap_names import answer_for_command
 from sfm_shapefit.cli.console import (
     EXIT_INTERRUPTED,
     catch_termination,
@@ -75,8 +75,8 @@ class _ByImportance(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command that is called; one of COLMAP's is answered with what it is here."""
-        if args[0] in COMMANDS and args[0] not in self.commands:
-            ctx.fail(f"{args[0]} is COLMAP's; here it is sfm-shapefit {COMMANDS[args[0]]}")
+        if answer := answer_for_command(args[0]):
+            ctx.fail(answer)
         return super().resolve_command(ctx, args)
 
     def list_commands(self, ctx: Any) -> list[str]:

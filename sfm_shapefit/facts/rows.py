@@ -87,7 +87,10 @@ def own_camera_rows(
     told = {
         "name": [graph.name_of(camera) for camera in cameras.tolist()],
         "placed": kept,
-        "reason": [why if ok else f"not trusted ({value:.2f}): {why}" for ok, value, why in of_each],
+        "reason": [
+            why if ok else f"not trusted ({value:.2f})" + (f": {why}" if why else "")
+            for ok, value, why in of_each
+        ],
         "piece": [placement.piece] * len(cameras),
         "center": np.where(kept[:, None], centers, np.nan),
         "degree": _degrees(inside, graph.num_nodes)[cameras],

@@ -112,6 +112,7 @@ def test_other_commands_take_colmaps_names_of_paths_too(tmp_path):
         ("map a b --GlobalMapper.min_num_matches=30", "here it is min_matches = ... in the file of --config"),
         ("map a b --SiftExtraction.max_num_features 9", "here it is --max-num-features"),
         ("map a b --GlobalMapper.keep_max_num_tracks 9", "this command has nothing like it; leave it out"),
+        ("check a --Mapper.min_num_matches 3", "this command has nothing like it; leave it out"),
         ("check a --Mapper.num_threads 3", "this command has nothing like it; leave it out"),
         ("map a b --project_path x.ini", "here it is --config FILE, in TOML"),
         ("locate a b --ba_gpu_index 0", "no GPU is used, so leave it out"),
@@ -140,8 +141,11 @@ def test_what_is_wrong_with_the_input_is_said_before_what_is_wrong_with_the_outp
     before = fingerprint(tmp_path)
     for typed, words in (
         ("map nosuch.db out", "nosuch.db does not exist"),
+        ("map nosuch out --camera-model OPENCV", "nosuch does not exist"),
+        (f"map {RING_MODEL} out", f"sfm-shapefit locate {RING_MODEL} OUT places its images anew"),
+        (f"map {RING_MODEL.parent} out", f"sfm-shapefit locate {RING_MODEL} OUT places its images anew"),
         ("map words.db out", "words.db is not a COLMAP database"),
-        ("map empty out", "empty is a folder without a database.db that holds no image"),
+        ("map empty out", "empty has no database.db and holds no image"),
         ("locate nosuch out", "nosuch does not exist"),
         (f"locate {RING_MODEL} out --priors nosuch.csv", "nosuch.csv does not exist"),
         (f"locate {RING_MODEL} out --database words.db", "words.db is not a COLMAP database"),

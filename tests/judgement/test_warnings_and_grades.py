@@ -10,6 +10,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.facts.located_warnings import located_warnings
+from sfm_shapefit.facts.rows import own_camera_rows
 from sfm_shapefit.facts.warnings import match_warnings, quality_warnings, support_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade, Kind, ModelVerdict, Reason, of_each
@@ -83,6 +84,14 @@ def test_an_image_that_is_left_out_is_named_where_it_is_listed_and_in_no_warning
     assert rows["not trusted"] == ["1 image of these; min_trust=0 keeps it"]
     assert told.verdict.cameras == (told.images.names[3],)
     assert not any(told.images.names[3] in warning for warning in located_warnings(told, ()))
+
+
+def test_an_image_left_out_by_a_high_min_trust_alone_is_told_without_an_empty_reason(ring_located):
+    placement = ring_located.placement
+    reasons = ("", "its pairs contradict it", *placement.assessment.reasons[2:])
+    doubted = replace(placement, assessment=replace(placement.assessment, reasons=reasons))
+    told = own_camera_rows(doubted, np.full((8, 3), np.nan), 1.0).columns["reason"]
+    assert list(told[:2]) == ["not trusted (1.00)", "not trusted (1.00): its pairs contradict it"]
 
 
 def test_evidence_that_is_told_is_in_the_verdict_and_each_named_camera_has_its_reason(ring_located):

@@ -26,6 +26,7 @@ from sfm_shapefit.files.colmap.intrinsics import fisheye_guess
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, name_of
 from sfm_shapefit.files.matching_options import MatchingOptions
+from sfm_shapefit.files.model_folder import model_folders
 
 _READABLE = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
 _OTHERS = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".mp4", ".mov", ".insv"})
@@ -53,10 +54,14 @@ def find_photographs(folder: Path) -> list[str]:
             elif suffix in _OTHERS:
                 others[suffix] += 1
     if len(names) < 2:
+        for model in (folder, *model_folders(folder)):
+            if any((model / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
+                anew = f"sfm-shapefit locate {model} OUT places its images anew"
+                raise InputError(f"{model} is a COLMAP model without a database.db; {anew}")
         found = "no image" if not names else f"only {names[0]}"
         unread = f" and {first_of([f'{n} {suffix}' for suffix, n in others.items()])}" if others else ""
         advice = "; convert these to .jpg first" if others else "; give a folder of two images or more"
-        raise InputError(f"{folder} is a folder without a database.db that holds {found}{unread}{advice}")
+        raise InputError(f"{folder} has no database.db and holds {found}{unread}{advice}")
     return sorted(names)
 
 
