@@ -93,4 +93,6 @@ def main(
 
 
 if __name__ == "__main__":
+    if not 6 <= len(sys.argv) <= 7:
+        sys.exit(print(__doc__, file=sys.stderr) or 2)
     main(*map(Path, sys.argv[1:6]), *(float(number) for number in sys.argv[6:7]))

@@ -58,4 +58,6 @@ def main(images: Path, out: Path, focal_length_px: float | None = None) -> pycol
 
 
 if __name__ == "__main__":
+    if not 3 <= len(sys.argv) <= 4:
+        sys.exit(print(__doc__, file=sys.stderr) or 2)
     main(Path(sys.argv[1]), Path(sys.argv[2]), *(float(number) for number in sys.argv[3:4]))

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.base.errors import InputError as InputError
     from sfm_shapefit.base.errors import ShapeFitError as ShapeFitError
     from sfm_shapefit.base.errors import UnsolvableError as UnsolvableError
+    from sfm_shapefit.base.executors import WorkerError as WorkerError
     from sfm_shapefit.facts.command_options import InspectOptions as InspectOptions
     from sfm_shapefit.facts.command_options import JoinOptions as JoinOptions
     from sfm_shapefit.facts.command_options import LocateOptions as LocateOptions
@@ -102,6 +103,7 @@ _HOMES = {
     "pipeline.workspace": ("Workspace", "workspace"),
     "pipeline.write": ("WriteOptions", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
+    "base.executors": ("WorkerError",),
     "facts.command_options": (
         "InspectOptions",
         "JoinOptions",

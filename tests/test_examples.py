@@ -84,6 +84,14 @@ def test_hlocs_files_become_placed_cameras(drawn, tmp_path):
     assert_near_truth(tmp_path / "out/models/0", folder)
 
 
+@pytest.mark.parametrize("name", ["pycolmap_pipeline.py", "hloc_outputs.py"])
+def test_an_example_without_arguments_says_how_it_is_called(name):
+    done = run_python(ROOT / "examples" / name)
+    assert done.returncode == 2
+    assert f"python examples/{name} IMAGES" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize("name", sfm_shapefit.__all__)
 def test_every_public_name_says_what_it_is_and_what_it_takes(name):
     public = getattr(sfm_shapefit, name)

@@ -34,14 +34,17 @@ def refuse_absent(*paths: Path | None) -> None:
             raise InputError(f"{path} does not exist")
 
 
-def refuse_no_folder(folder: Path) -> None:
-    """Refuse what is no folder of images.
+MASKS = "that of the masks, NAME.png for image NAME"
+
+
+def refuse_no_folder(folder: Path, wanted: str = "the one that the names of the images start from") -> None:
+    """Refuse what is no folder, of images unless something else is wanted.
 
     Raises:
         InputError: a sentence that says so.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder; give the one that the names of the images start from")
+        raise InputError(f"{folder} is no folder; give {wanted}")
 
 
 def file_of(folder: Path, name: str) -> Path | None:

@@ -23,6 +23,7 @@ from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origi
 
 S = TypeVar("S", bound="Settings")
 
+_COLORS = "points get colors when a result is written: found.write(folder, images=...)"
 _HELP_WIDTH = 88  # columns; the text of the help as it stands indented on a terminal
 
 
@@ -178,11 +179,12 @@ def merge_options(given: S | None, settings: type[S], overrides: Mapping[str, An
     """
     if given is not None and not isinstance(given, settings):
         kind, wanted = type(given).__name__, settings.__name__
-        raise TypeError(f"options must be {wanted}(...), got a {kind}; or give single options by keyword")
+        raise TypeError(f"options must be {wanted}(...), got {kind}; or give single options by keyword")
     known = homes_of(settings)
     for name in overrides:
         if name not in known and name not in known.values():
-            raise TypeError(f"{name!r} is no option of {settings.__name__}; {hint(name, known)}")
+            said = _COLORS if name == "images" else hint(name, known)
+            raise TypeError(f"{name!r} is no option of {settings.__name__}; {said}")
     if given is None:
         return settings(**overrides)
     return replace(given, **overrides) if overrides else given

@@ -100,9 +100,10 @@ class LengthsFacts(Record):
     def told(self) -> list[Row]:
         """Return what the terminal says."""
         scale = f"known to {100.0 * (self.scale_sigma or 0.0):.2g} %, included"
-        unknown = "how well it is known is not known, and not included"
+        unknown = f"its error is not known{', and not included' if self.usual else ''}"
+        none = "their errors are not known; a model of at most 2,000 frames with 3D points tells them"
         return [
-            row("lengths", self.usual.statement if self.usual else "how well they are known is not known"),
+            row("lengths", self.usual.statement if self.usual else none),
             Row("between", [f"{one.first} and {one.second}: {one.length.interval}" for one in self.lengths]),
             row("scale", unknown if self.scale_sigma is None else scale),
             Row("scale bars", [one.line for one in self.scale_bars]),

@@ -96,7 +96,7 @@ class MapResult(Written, Tabled):
     joined: tuple[JoinedModel, ...] = ()
     """Models that were joined, in one world; each stands in `models` by itself too."""
     warnings: tuple[str, ...]
-    """What the user should know beyond the warnings of each model."""
+    """What the user should know of the run; each of the `models` has warnings of its own."""
     images: Path | None = None
     """Folder of the photographs of which the database was made, in the folder of the result."""
 

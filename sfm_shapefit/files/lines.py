@@ -42,12 +42,12 @@ def refuse_database(path: Path) -> None:
     """Refuse a database where a model or a text file is wanted.
 
     Raises:
-        InputError: if it is one; it says which command takes it.
+        InputError: if it is one; it says what takes it.
     """
     if is_database(path):
         raise InputError(
-            f"{path} is a database: `sfm-shapefit map` makes a model from it alone; the other commands take "
-            "the model's folder, and the database by --database"
+            f"{path} is a database: `sfm-shapefit map`, in Python `map_database`, makes a model from it "
+            "alone; elsewhere give the model's folder, and the database after it (--database, database=)"
         )
 
 

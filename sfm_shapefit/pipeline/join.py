@@ -59,8 +59,10 @@ def join(
     options = merge_options(options, JoinOptions, overrides)
     clock = Clock.of(progress)
     with clock("read"):
-        if isinstance(models, Path | str) or len(models) < 2:
-            raise InputError("a join needs two models or more; give their folders one after the other")
+        if not isinstance(models, list | tuple) or len(models) < 2:
+            raise InputError(
+                "a join needs two models or more, in a list; those of `map_database` are its `models`"
+            )
         inputs = choose_inputs(models[0], database)
         pieces = read_pieces(models, inputs.database)
         names = sorted({name for piece in pieces for name in piece.model.images.names})
@@ -75,8 +77,7 @@ def join(
                 matches = stack.enter_context(_opened(pieces, inputs.database, names))
             elif not shares:
                 raise InputError(
-                    "the models share no image, and there is no database with matches between them; give "
-                    "one with --database"
+                    "the models share no image, and there is no database with matches between them; give one"
                 )
             tied = tie_pieces(pieces, matches, inputs.left_out)
         with clock("join"):

@@ -149,8 +149,10 @@ def evaluate_lengths(
 
     Raises:
         InputError: if the model or the bars cannot be used, or it has no such image or point.
-        UnsolvableError: if nothing is known of errors: where images observe no points, or are above 2,000.
+        UnsolvableError: if nothing is known of the errors of the `ends`: where images observe no points, or
+            are above 2,000. Without `ends`, `usual` is None then.
     """
+    _refuse_no_pairs(ends)
     posed = read_by_itself(model, with_lenses=True)
     seen = images, points, estimate = _estimate_of(posed)
     scale_sigma = model_scale_sigma(model)
@@ -174,6 +176,15 @@ def evaluate_lengths(
             *(f"how well the distance of {ends} is known is not known; choose others" for ends in unknown),
         ],
     )
+
+
+def _refuse_no_pairs(ends: object) -> None:
+    """Refuse what is no list of pairs, one pair outside a list included."""
+    listed = ends if isinstance(ends, list | tuple) else [ends]
+    if not all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in listed):
+        raise InputError(
+            'ends must be a list of pairs of places, such as [("0001.jpg", "0004.jpg"), (17, 402)]'
+        )
 
 
 def _num_draws(estimate: Estimate | None) -> int:

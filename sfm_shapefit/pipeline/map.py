@@ -58,8 +58,8 @@ def map_database(
 
     Returns:
         `models`, most cameras first, each as `locate` returns it, with the rotations that it started from as
-        its `averaging`; `left_out`, the reason for each image in no model; `warnings`. Cameras, pairs,
-        verdict and report are those of the first model.
+        its `averaging`; `left_out`, the reason for each image in no model; `warnings` of the run,
+        beside those of each model. Cameras, pairs, verdict and report are those of the first model.
 
     Raises:
         InputError: if the database cannot be used; the message says what to do.

@@ -9,7 +9,7 @@ from typing import Any
 
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.paths import refuse_no_folder
+from sfm_shapefit.base.paths import MASKS, refuse_no_folder
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import flat_values, merge_options
 from sfm_shapefit.base.wording import first_of
@@ -64,7 +64,7 @@ def match_images(
     folder, path = Path(images), Path(database)
     refuse_lens(options)
     if options.mask_path:
-        refuse_no_folder(Path(options.mask_path))
+        refuse_no_folder(Path(options.mask_path), MASKS)
     found = find_photographs(folder)
     refuse_rigs(options, found)
     made = PhotographDatabase(

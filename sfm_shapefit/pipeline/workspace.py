@@ -20,7 +20,7 @@ from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, angle_between_deg
-from sfm_shapefit.base.paths import refuse_no_folder
+from sfm_shapefit.base.paths import MASKS, refuse_no_folder
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.base.wording import counted, counted_are, first_of
 from sfm_shapefit.facts.tables import model_datum
@@ -94,8 +94,9 @@ def workspace(
     """
     options = merge_options(options, UndistortionOptions, overrides)
     masks = Path(options.mask_path) if options.mask_path else None
-    for given in filter(None, (Path(images), masks)):
-        refuse_no_folder(given)
+    refuse_no_folder(Path(images))
+    if masks:
+        refuse_no_folder(masks, MASKS)
     clock = Clock.of(progress)
     with clock("read"):
         read = read_by_itself(model_of(model), with_lenses=True)

@@ -178,9 +178,7 @@ def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
     merged = merge_options(given, LocateOptions, {"min_trust": 0.0})
     assert (merged.trust.min_trust, merged.nodes.points) == (0.0, "never")
     assert merge_options(None, LocateOptions, {}) == LocateOptions()
-    with pytest.raises(
-        TypeError, match=r"options must be LocateOptions\(\.\.\.\), got a dict; or give single"
-    ):
+    with pytest.raises(TypeError, match=r"options must be LocateOptions\(\.\.\.\), got dict; or give single"):
         merge_options({"min_trust": 0.0}, LocateOptions, {})
     with pytest.raises(TypeError, match="'min_trus' is no option of LocateOptions; did you mean min_trust"):
         merge_options(given, LocateOptions, {"min_trus": 0.0})

@@ -108,8 +108,32 @@ def test_a_result_serves_wherever_a_model_does(tmp_path, ring_located, ring_mapp
 def test_a_graph_is_placed_from_its_file_and_is_no_model():
     placed = sfm_shapefit.place(BUNDLED / "graph40.txt")
     assert len(placed.cameras) == 40
-    with pytest.raises(sfm_shapefit.InputError, match="a PlacedGraph is no model; give a folder"):
+    with pytest.raises(sfm_shapefit.InputError, match="or a result; got PlacedGraph"):
         sfm_shapefit.evaluate(placed, RING / "sparse/0")
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: sfm_shapefit.locate(42), "a model is a folder, a reconstruction or a result; got int"),
+        (lambda: sfm_shapefit.locate(RING / "database.db"), "in Python `map_database`, makes a model"),
+        (lambda: sfm_shapefit.map_database(RING / "sparse"), "with `match_images`"),
+        (lambda: sfm_shapefit.map_database(RING, images="x"), r"written: found\.write\(folder, images="),
+        (
+            lambda: sfm_shapefit.workspace(RING / "sparse/0", RING, "o", mask_path="no"),
+            "no is no folder.*masks",
+        ),
+        (lambda: sfm_shapefit.match_images(RING, "o", mask_path="no"), "no is no folder.*masks"),
+    ],
+)
+def test_what_cannot_serve_is_refused_in_words_of_python(call, said):
+    with pytest.raises((sfm_shapefit.InputError, TypeError), match=said):
+        call()
+
+
+def test_a_mapped_result_is_no_list_of_models(ring_mapped):
+    with pytest.raises(sfm_shapefit.InputError, match="in a list; those of `map_database` are its `models`"):
+        sfm_shapefit.join(ring_mapped)
 
 
 def test_results_write_themselves_and_show_at_most_twenty_attributes(tmp_path, ring_mapped):

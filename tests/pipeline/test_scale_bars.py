@@ -285,3 +285,18 @@ def test_evaluate_and_check_compare_with_bars_and_tell_lengths(ring, tmp_path):
         done = CliRunner().invoke(app, ["evaluate", model, *more])
         assert done.exit_code == code
         assert said in " ".join(done.output.replace("│", " ").split())
+
+
+@pytest.mark.parametrize("ends", [("0001.jpg", "0004.jpg"), "0001.jpg", 17, [(1, 2, 3)]])
+def test_ends_that_are_no_list_of_pairs_are_refused(ends):
+    with pytest.raises(InputError, match="ends must be a list of pairs of places"):
+        sfm_shapefit.evaluate_lengths(RING / "sparse/0", ends)
+
+
+def test_without_points_errors_are_not_known_and_lengths_refused():
+    poses = sfm_shapefit.average_database(RING / "database.db")
+    found = sfm_shapefit.evaluate_lengths(poses)
+    assert found.usual is None
+    assert "their errors are not known" in str(found.told())
+    with pytest.raises(sfm_shapefit.UnsolvableError, match="whose images observe 3D points"):
+        sfm_shapefit.evaluate_lengths(poses, [("0001.jpg", "0004.jpg")])

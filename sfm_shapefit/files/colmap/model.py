@@ -115,9 +115,7 @@ def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> Colma
     elif isinstance(source, Path | str):
         label, (arrays, notes) = str(Path(source)), read_folder(Path(source))
     else:
-        raise InputError(
-            f"a {type(source).__name__} is no model; give a folder, a reconstruction or a result"
-        )
+        raise InputError(f"a model is a folder, a reconstruction or a result; got {type(source).__name__}")
     arrays, note = _with_unit_quaternions(arrays)
     notes = (*notes, *filter(None, [note]))
     images, given = images_of(arrays), None if notes else given

@@ -74,7 +74,10 @@ def database_in(path: Path) -> Path:
         return path
     beside = database_beside(path)
     if beside is None:
-        raise InputError(f"{path} is a folder without a {DATABASE_NAMES[0]}; give the database file itself")
+        raise InputError(
+            f"{path} is a folder without a {DATABASE_NAMES[0]}; give the database file itself, or make one "
+            "of images with `match_images`"
+        )
     return beside
 
 

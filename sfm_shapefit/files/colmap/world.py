@@ -106,7 +106,7 @@ def world_of(datum: EarthDatum | None, centers: FloatArray, crs: str, offset: st
         if datum is None:
             raise InputError(
                 "the model has no datum, so that nothing says where on Earth it is; convert the output "
-                "of locate or map with --priors or --control-points of known latitude and longitude"
+                "of locate or map with priors or control points of known latitude and longitude"
             )
         world = World(datum=datum, code=epsg_code(crs, datum))
     if offset == "auto":
