@@ -12,7 +12,7 @@ from tests.program import run_python
 MOST_ARROWS = 75  # between rooms, beside those to base/; the list may only become shorter
 
 # Lines of the package, docstrings and blank ones counted; who raises it says in the commit what they buy.
-MOST_LINES = 64_450
+MOST_LINES = 64_600
 MOST_LINES_OF_A_PAGE = 150  # of the pipeline of a command, so that its stages are seen at one glance
 SLACK_LINES = 300  # a budget further above the package than this is to be lowered
 
