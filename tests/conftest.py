@@ -44,9 +44,9 @@ def drawn(tmp_path_factory) -> tuple[RenderedScene, Path]:
     return scene, folder
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture
 def dask_client():
-    """A client of two workers, threads of this process."""
+    """A client of two workers, threads of this process, which end with the test: they draw random numbers."""
     with client_of(2) as client:
         yield client
 
