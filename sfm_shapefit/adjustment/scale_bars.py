@@ -19,7 +19,8 @@ from sfm_shapefit.adjustment.place_errors import Distances, ScaleErrors
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.scene.given import ScaleBars
 
-_MOST_SIGMAS = 4.0  # standard deviations; bars farther off contradict the others: 1 right bar of 16,000
+MOST_SIGMAS = 4.0
+"""Standard deviations; bars farther off contradict the others, or the model: 1 right bar of 16,000."""
 
 
 class BarFit(NamedTuple):
@@ -48,7 +49,7 @@ class BarFit(NamedTuple):
     @property
     def contradict(self) -> bool:
         """Whether bars that set the scale contradict one another."""
-        return bool((np.abs(self.scores[self.used]) > _MOST_SIGMAS).any())
+        return bool((np.abs(self.scores[self.used]) > MOST_SIGMAS).any())
 
 
 def fit_scale_bars(bars: ScaleBars, found: Distances) -> BarFit | None:
@@ -70,12 +71,12 @@ def fit_scale_bars(bars: ScaleBars, found: Distances) -> BarFit | None:
                 signs = np.where(np.arange(len(y)) == k, 1.0, -_weights(shared, own, others))
                 scores[k] = -signs[known] @ y[known] / np.sqrt(_variance(shared, own, signs, known))
         off = np.where(used, np.abs(np.nan_to_num(scores)), 0.0)
-        if used.sum() <= 2 or off.max() <= _MOST_SIGMAS:
+        if used.sum() <= 2 or off.max() <= MOST_SIGMAS:
             break
         used = used & (np.arange(len(y)) != np.argmax(off))
     weights = _weights(shared, own, used)
     sigma = np.sqrt(_variance(shared, own, weights, used))
-    if off.max() > _MOST_SIGMAS:
+    if off.max() > MOST_SIGMAS:
         sigma = max(sigma, 0.5 * np.ptp(y[used]))
     draws = -weights[used] @ shared[used]
     return BarFit(

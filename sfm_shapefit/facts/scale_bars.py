@@ -6,13 +6,11 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from sfm_shapefit.adjustment.place_errors import Distances
-from sfm_shapefit.adjustment.scale_bars import BarFit
+from sfm_shapefit.adjustment.scale_bars import MOST_SIGMAS, BarFit
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded
 from sfm_shapefit.placement.control_points import TriangulatedMarks
 from sfm_shapefit.scene.given import ScaleBars
-
-_WRONG = 4.0  # standard deviations; a right check bar is no farther off
 
 
 class ScaleBar(Record):
@@ -116,7 +114,7 @@ class MeasuredBars(NamedTuple):
                 f"{place_of[first]}: {first}{_more(lost)} of no use: an end lacks agreeing marks in two "
                 "placed images that see it from far enough apart, or both are one point; mark it in others"
             )
-        off = [row for row in rows if row.found is not None and abs(row.error_sigmas or 0.0) > _WRONG]
+        off = [row for row in rows if row.found is not None and abs(row.error_sigmas or 0.0) > MOST_SIGMAS]
         off = [row for row in off if self.fit is None or row.use != "control" or self.fit.contradict]
         if off:
             worst = max(off, key=lambda row: abs(row.error_sigmas or 0.0))

@@ -211,18 +211,19 @@ def _between(
 ) -> Iterator[LengthBetween]:
     """Yield how well the distance of each two places of a model is known."""
     images, points, estimate = seen
-    if ends and (estimate is None or estimate.draws is None):
+    if not ends:
+        return
+    if estimate is None or estimate.draws is None:
         raise UnsolvableError(
             "errors are known of models of at most 2,000 frames whose images observe 3D points; leave "
             "lengths out"
         )
+    cameras = errors_of_images(images, draws_at(estimate, images))
     for first, second in ends:
-        assert estimate is not None
         rows = np.array([_row_of(images, points, end) for end in (first, second)])
         if rows[0] == rows[1]:
             raise InputError(f"{first} and {second} are one place, and no length; name two")
         own, chosen = rows < images.num_images, rows - images.num_images
-        cameras = errors_of_images(images, draws_at(estimate, images))
         places = cameras.followed_by(_errors_of(images, points, estimate, chosen[~own]))
         rows[~own] = images.num_images + np.arange(np.sum(~own))
         apart = places.apart(rows[None]).in_scale(scale)
