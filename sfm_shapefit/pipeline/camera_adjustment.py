@@ -57,6 +57,11 @@ def pull_cameras(state: ModelState) -> ModelState:
         return state.failed(f"the position priors do not pull its cameras: {error}")
     frames = state.source.images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
     held = pulled.anchors._replace(indices=frames)
+    if pulled.vagueness > 1.0:
+        state = state.warned(
+            f"the position priors are {pulled.vagueness:.2g} times as far off as their standard deviations "
+            "say, and count as so vague; give larger ones"
+        )
     return replace(state, placement=pulled.placement, frame=pulled.gauge, held=held)
 
 

@@ -1,13 +1,21 @@
-"""Position priors that pull the cameras: opt-in, after they have set scale, origin and axes."""
+"""Position priors that pull the cameras: opt-in, after they have set scale, origin and axes.
+
+Standard deviations that are given are often too small, as those of GPS are. The kernel of `refine_anchored`
+would then hold on to the few priors that happen to fit, and shift the whole model to these. Where most priors
+are farther off than it reaches, deviations start as large as the residuals, and are halved down to those that
+are given, as long as half of the priors or more are within its reach (graduated non-convexity, Blake,
+Zisserman 1987, "Visual Reconstruction").
+"""
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import MEDIAN_NORMAL_LENGTH
-from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.gauge import FEWEST_CHECKED, Gauge
 from sfm_shapefit.placement.place import Placement, replace_locations
 from sfm_shapefit.refinement.anchored import refine_anchored, weighted_anchors
 from sfm_shapefit.refinement.angular import KERNEL_WIDTH
@@ -29,6 +37,8 @@ class Pulled(NamedTuple):
     anchors: KnownPositions
     """The priors by the placement's cameras, in its gauge but for the axes, which are the input's; each has
     the weight that it ended with: a wrong one has none."""
+    vagueness: float
+    """Ratio of the standard deviations that the priors count with to those that are given, 1 or more."""
 
 
 def pull_to_priors(
@@ -45,7 +55,16 @@ def pull_to_priors(
     start = gauge.similarity.apply(refined.locations)
     anchors = _anchor(start, known, np.eye(3) if gauge.axes is None else gauge.axes)
     levels = np.radians(np.array(refined.levels_deg))
-    moved = refine_anchored(part, start, levels, anchors, max_bytes=options.solver.factor_bytes)
+    refine = partial(refine_anchored, part, levels=levels, max_bytes=options.solver.factor_bytes)
+    vagueness = 1.0 if _fit_most(anchors, start) else _vagueness(anchors, start)
+    moved = refine(start, anchors=_vaguer(anchors, vagueness))
+    while vagueness > 1.0:
+        sharper = max(0.5 * vagueness, 1.0)
+        then = refine(moved, anchors=_vaguer(anchors, sharper))
+        if not _fit_most(_vaguer(anchors, sharper), then):
+            break
+        moved, vagueness = then, sharper
+    anchors = _vaguer(anchors, vagueness)
     by = float(np.median(np.linalg.norm((moved - start)[: len(placement.cameras)], axis=1)))
     held = anchors.indices[anchors.chi2(moved) <= KERNEL_WIDTH**2]
     kept = replace(
@@ -58,7 +77,24 @@ def pull_to_priors(
         replace_locations(placement, kept),
         replace(gauge, statement=f"{gauge.statement}{PULLED}{by:.3g} (median)"),
         weighted_anchors(anchors, moved),
+        vagueness,
     )
+
+
+def _fit_most(anchors: KnownPositions, t: FloatArray) -> bool:
+    """Return whether the kernel reaches half of the anchors; all of so few that do not check one another."""
+    held = anchors.chi2(t) <= KERNEL_WIDTH**2
+    return bool(np.mean(held) >= (0.5 if len(held) >= FEWEST_CHECKED else 1.0))
+
+
+def _vagueness(anchors: KnownPositions, t: FloatArray) -> float:
+    """Return how many times as far off anchors are as they say, in the median."""
+    return float(np.sqrt(np.median(anchors.chi2(t)))) / MEDIAN_NORMAL_LENGTH
+
+
+def _vaguer(anchors: KnownPositions, vagueness: float) -> KnownPositions:
+    """Return the anchors with standard deviations so many times as large."""
+    return anchors._replace(information=anchors.information / vagueness**2)
 
 
 def _anchor(start: FloatArray, known: KnownPositions, axes: FloatArray) -> KnownPositions:
