@@ -17,7 +17,7 @@ Do not use, if any of these holds:
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
 placed but are not in the output, that are kept though their matches make no points, that many pairs
 contradict and no pixels confirm (`witnesses`), or that evidence which the fit did not use names: another
-place, a seam, a wrong lens, a lens or a place that hardly can be (`lenses`, `flights`). Trust is not low
+place, a seam, a wrong lens, a lens, a place or a rig that hardly can be (`lenses`, `flights`, `rig_offsets`). Trust is not low
 where the pixels confirm a camera. Look also, though no camera can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade

@@ -3,12 +3,21 @@
 Programs that shrink pictures write the pixels of one size and the cameras of another. Pixels count from the
 corner, so that each observation is then the projection of its point times a factor that all images share; a
 wrong focal length scales from the middle instead.
+
+Keypoints outside their picture are of another one: larger, or turned by 90 degrees, as where one program
+followed the orientation in the EXIF data and another did not. Models that were undistorted have observations
+outside their pictures, too, but no database with these.
 """
+
+from collections.abc import Iterator
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.judgement.conventions import Recognized
+from sfm_shapefit.judgement.evidence import OddImages
+from sfm_shapefit.judgement.limits import CHANCE_SHARE, FITTING_PX
+from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.points import Points
 
@@ -61,3 +70,18 @@ def recognize_resolution(points: Points, images: Images, pictures: KeypointRays)
         f"their median reprojection error is {before:.3g} px, and {after:.1f} px at its scale",
         "bring both to one resolution",
     )
+
+
+def find_outside(images: Images, points: Points, pictures: KeypointRays) -> Iterator[OddImages]:
+    """Yield the images of lenses more than 5 % of whose observations are outside the picture."""
+    outside, every = np.zeros((2, len(images.lenses)))
+    for k, rows in enumerate(points.rows_of_images(images.num_images)):
+        if len(rows) and images.is_posed[k] and (images.sizes_px[k] > 0).all():
+            pixels = pictures.pixels(k, points.keypoints[rows])
+            is_out = (pixels < -FITTING_PX) | (pixels > images.sizes_px[k] + FITTING_PX)
+            outside[images.lens_of[k]] += np.count_nonzero(is_out.any(axis=1))
+            every[images.lens_of[k]] += len(rows)
+    shares = (outside / np.maximum(every, 1))[images.lens_of]
+    if (odd := np.flatnonzero(images.is_posed & (shares > CHANCE_SHARE))).size:
+        sentence = "keypoints outside the picture, {} % of them: is that of another size, or turned by 90 degrees?"
+        yield OddImages.of_values(Kind.INPUT, images.names_of(odd), 100.0 * shares[odd], sentence)

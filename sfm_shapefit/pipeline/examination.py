@@ -21,6 +21,8 @@ from sfm_shapefit.judgement.flights import find_flights
 from sfm_shapefit.judgement.lenses import find_odd_lenses
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, FITTING_PX, OUTNUMBERED, SMALLEST_SHAPE
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
+from sfm_shapefit.judgement.resolutions import find_outside
+from sfm_shapefit.judgement.rig_offsets import find_contradicted_rigs
 from sfm_shapefit.judgement.seams import GroupApart, find_cuts, find_seams
 from sfm_shapefit.judgement.ties import (
     Rays,
@@ -63,9 +65,10 @@ def gather_evidence(
     odd = (*find_odd_lenses(images, points, pictures, bogus), *find_flights(images))
     if fits is None:
         return ModelEvidence(lenses=lenses, odd=odd)
+    odd = (*odd, *find_contradicted_rigs(images, fits.directions))
     if source.has_database and _has_keypoints(source.view, structure):
         given = images, points, pictures, fits.directions, source.view
-        odd = (*odd, *find_split_duplicates(*given, threads))
+        odd = (*odd, *find_split_duplicates(*given, threads), *find_outside(images, points, pictures))
     tied, untied = _tie(source, fits, structure)
     cuts, seams = find_cuts(*fits.sides, tied), tuple[GroupApart, ...]()
     if cuts:  # which are seams by the rotations that pairs across have by themselves

@@ -187,9 +187,8 @@ def distance_gauge(
         raise InputError(f"the cameras {name} coincide, so their distance sets no scale; choose two others")
     scale, weights, sigma = _scale_of_distances(apart, distances)
     residuals = scale * apart - distances
-    sentence = f"{names[0]} are {distances[0]:g} apart"
+    sentence, worst = f"{names[0]} are {distances[0]:g} apart", int(np.argmax(np.abs(residuals)))
     if len(distances) > 1:
-        worst = int(np.argmax(np.abs(residuals)))
         sentence = (
             f"{int(np.sum(weights >= 0.5))} of {len(distances)} known distances agree, on a scale known to "
             f"{100.0 * sigma:.2g} %; {names[worst]} miss theirs most, by {residuals[worst]:.3g}"
@@ -202,7 +201,12 @@ def distance_gauge(
         statement=statement,
         scale_statement=f"distance: {sentence}",
         scale_sigma=sigma if len(distances) > 1 else None,
-        warning=f"the known distances contradict one another: {sentence}" if sigma > METRIC_SIGMA else "",
+        warning=(
+            f"the known distances contradict one another, so that the scale is known to {100.0 * sigma:.2g} % only: "
+            f"{names[worst]} miss theirs most, by {residuals[worst]:.3g}"
+            if sigma > METRIC_SIGMA
+            else ""
+        ),
     )
 
 
