@@ -83,5 +83,7 @@ def find_outside(images: Images, points: Points, pictures: KeypointRays) -> Iter
             every[images.lens_of[k]] += len(rows)
     shares = (outside / np.maximum(every, 1))[images.lens_of]
     if (odd := np.flatnonzero(images.is_posed & (shares > CHANCE_SHARE))).size:
-        sentence = "keypoints outside the picture, {} % of them: is that of another size, or turned by 90 degrees?"
+        sentence = (
+            "keypoints outside the picture, {} % of them: is that of another size, or turned by 90 degrees?"
+        )
         yield OddImages.of_values(Kind.INPUT, images.names_of(odd), 100.0 * shares[odd], sentence)

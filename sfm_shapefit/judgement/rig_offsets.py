@@ -27,7 +27,8 @@ def find_contradicted_rigs(images: Images, directions: PairDirections) -> Iterat
     pairs = directions.pairs[inside]
     lenses, which = np.unique(images.lens_of[pairs], axis=0, return_inverse=True)
     rig_from_world = (
-        images.sensors.rotations[images.lens_of[pairs[:, 0]]].transpose(0, 2, 1) @ images.rotations[pairs[:, 0]]
+        images.sensors.rotations[images.lens_of[pairs[:, 0]]].transpose(0, 2, 1)
+        @ images.rotations[pairs[:, 0]]
     )
     measured = np.einsum("kab,kb->ka", rig_from_world, directions.directions[inside])
     known = (directions.sigma_deg()[inside] <= KNOWN_DEG) & (directions.parallax_deg[inside] >= KNOWN_DEG)

@@ -105,6 +105,24 @@ def test_observations_in_another_resolution_are_said_with_their_ratio():
     assert found.reconstruction.cameras[1].params.tolist() == camera.params.tolist()
 
 
+def test_keypoints_of_a_picture_that_is_turned_by_90_degrees_are_told(tmp_path):
+    """As where one program follows the orientation in the EXIF data, and another does not."""
+    folder = copied(COURTYARD, tmp_path)
+    model, database = pycolmap.Reconstruction(folder / "sparse" / "0"), folder / "database.db"
+    (camera,) = model.cameras.values()
+
+    def told():
+        reasons = check(model, database, second_opinion=False).verdict.reasons
+        return [one for one in reasons if "keypoints outside the picture" in one]
+
+    assert not told()
+    width, height = camera.height, camera.width
+    camera.width, camera.height, camera.params = width, height, [1000.0, 0.5 * width, 0.5 * height, 0.0]
+    values = np.array(camera.params, dtype="<f8").tobytes().hex()
+    edit_database(database, f"UPDATE cameras SET width = {width}, height = {height}, params = x'{values}'")
+    assert len(told()) == 1
+
+
 def test_a_database_of_pictures_in_another_resolution_is_said():
     model = pycolmap.Reconstruction(RING / "sparse" / "0")
     (camera,) = model.cameras.values()

@@ -218,6 +218,30 @@ def moved_ring(tmp_path):
     return model, centers, names, truth.names
 
 
+def input_findings(verdict):
+    """Return the sentences that doubt the input."""
+    return [one.sentence for one in verdict.findings if one.kind == "input"]
+
+
+@pytest.mark.parametrize(("offset", "told"), [(0.0, "have one center"), (1.0, "contradict by 90 degrees")])
+def test_a_rig_that_matches_inside_its_frames_contradict_is_told(tmp_path, offset, told):
+    scene = make_scene(SceneOptions(rig="pair", shape="courtyard", num_images=16, num_points=800, seed=2))
+    write_workspace(scene, tmp_path / "yard")
+    database, model = (
+        tmp_path / "yard" / "database.db",
+        pycolmap.Reconstruction(tmp_path / "yard" / "sparse" / "0"),
+    )
+    assert not input_findings(sfm_shapefit.check(model, database, second_opinion=False).verdict)
+    (sensor,) = model.rig(1).non_ref_sensors
+    pose = model.rig(1).sensor_from_rig(sensor)
+    side = np.linalg.norm(pose.translation) * np.array([0.0, 0.0, offset])  # truth: along x
+    model.rig(1).set_sensor_from_rig(sensor, pycolmap.Rigid3d(pose.rotation, side))
+    verdict = sfm_shapefit.check(model, database, second_opinion=False).verdict
+    (sentence,) = input_findings(verdict)
+    assert told in sentence
+    assert len(verdict.cameras) == 16
+
+
 def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(moved_ring):
     model, centers, names, all_names = moved_ring
     given = poses_of(model)
