@@ -137,7 +137,7 @@ __all__ = list(_HOME_OF)
 
 def _load_writers() -> _Any:
     """Return what writes results, for `base.display`, which stands below it."""
-    return _import_module(f"{__name__}.pipeline.write").WRITERS
+    return _import_module(f"{__name__}.commands.write").WRITERS
 
 
 def __getattr__(name: str) -> _Any:
