@@ -30,7 +30,8 @@ from sfm_shapefit.adjustment.residuals import NormalEquations, Values, linearize
 from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points, invert_points, step_points
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.executors import Crew
-from sfm_shapefit.laplacian.operators import Workers, group_by
+from sfm_shapefit.base.lists import group_by
+from sfm_shapefit.laplacian.operators import Workers
 
 _FRAMES_OF_A_PART = 250  # frames; a part has some hundred thousand observations, sent once: a few MB
 

@@ -140,9 +140,9 @@ class CholeskyFactor:
         return self.refactor_alike(diagonal, weights)
 
     def refactor_alike(self, diagonal: FloatArray, weights: FloatArray) -> bool:
-        """Factor the Laplacian of symmetric weights (m, b, b), but with blocks (n, b, b) of its own at the nodes.
+        """Factor the Laplacian of symmetric weights (m, b, b) with other blocks (n, b, b) at the nodes.
 
-        Returns the same as `refactor_blocks`.
+        Returns what `refactor_blocks` does.
         """
         self._diagonal[:] = diagonal[self.plan.permutation].reshape(self._diagonal.shape)
         return self._factor(self._input(np.ascontiguousarray(weights)))

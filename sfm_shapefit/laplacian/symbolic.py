@@ -25,7 +25,8 @@ import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.laplacian.operators import Adjacency, group_by
+from sfm_shapefit.base.lists import group_by
+from sfm_shapefit.laplacian.operators import Adjacency
 
 _MERGE_ALWAYS = 0.03  # share of zeros in the merged panel; up to it a child joins its parent in any case
 _MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))  # columns and share of zeros; small panels may have more

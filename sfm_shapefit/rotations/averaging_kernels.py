@@ -90,7 +90,7 @@ def reweigh_pairs(
     begin: int, end: int, pairs: Any, measured: Any, turns: Any, weights: Any, scale: float, robust: Any,
     pulls: Any,
 ) -> None:  # fmt: skip
-    """Fill robust weights (k,), weights / (1 + (|x| / scale)^2)^2, and W x (k, 3), of the pairs begin..end-1."""
+    """Fill robust weights W (k,), weights / (1 + (|x| / scale)^2)^2, and W x (k, 3), from begin to end."""
     for e in range(begin, end):
         square = _world_residual(measured[e], turns[pairs[e, 0]], turns[pairs[e, 1]], pulls[e])
         w = weighed(GEMAN_MCCLURE, weights[e], square / (scale * scale))
