@@ -50,7 +50,7 @@ def covariances(problem):
 
 
 def test_threads_that_share_the_pairs_change_no_bit():
-    graph = box_graph_problem(700, 16.0, seed=4).view_graph
+    graph = ring_graph_problem(600, 18.0, seed=4).view_graph
     problem = rotation_problem(graph.num_nodes, graph.edges, noise=0.01)
     given = problem.relative.pairs, problem.relative.rotations, problem.relative.information
     assert len(given[0]) > 5_000  # a thread takes as many at once
