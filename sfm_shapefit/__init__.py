@@ -89,7 +89,7 @@ _HOMES = {
     "adjustment.adjustment_options": ("AdjustmentOptions",),
     "commands.bundle_adjust": ("AdjustedModel", "bundle_adjust"),
     "commands.check": ("check", "check_pieces"),
-    "pipeline.referee": ("CheckResult",),
+    "facts.check_result": ("CheckResult",),
     "commands.convert": ("convert",),
     "commands.drop_in": ("average_database", "global_mapping"),
     "commands.evaluate": ("evaluate",),

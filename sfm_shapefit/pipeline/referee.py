@@ -33,6 +33,7 @@ from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import contradicting
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
+from sfm_shapefit.judgement.check_reasons import CheckedModel, of_alike_pictures, reasons_against
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
@@ -44,7 +45,6 @@ from sfm_shapefit.judgement.reasons import (
 )
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models
-from sfm_shapefit.judgement.standing import Standing, of_alike_pictures, reasons_against
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence
@@ -175,7 +175,7 @@ def compare_with_other(state: CheckState) -> CheckState:
 def grade_model(state: CheckState, clock: Clock) -> CheckState:
     """Weigh what speaks against the model; an input in another convention or resolution explains the rest."""
     source = state.source
-    standing = Standing(
+    known = CheckedModel(
         images=state.images,
         fits=state.fits,
         evidence=state.evidence,
@@ -185,7 +185,7 @@ def grade_model(state: CheckState, clock: Clock) -> CheckState:
         is_matched_here=source.inputs.is_made,
         num_missing=len(source.matches.missing_names),
     )
-    reasons = tuple(reasons_against(standing))
+    reasons = tuple(reasons_against(known))
     verdict = ModelVerdict.weigh(reasons)
     if verdict.is_bad and (far := source.inputs.far):
         near = check_source(state.model, source.without(far), state.options, clock.anew()).verdict

@@ -16,11 +16,11 @@ from sfm_shapefit.scene.images import Images
 _ROUNDING = 1e-9  # share of the largest coordinate; cameras no farther apart stand at the same place
 
 
-class Standing(NamedTuple):
+class CheckedModel(NamedTuple):
     """A model as it stands, and what is known of it."""
 
     images: Images
-    """Those with a pose."""
+    """The images with a pose."""
     fits: PairFits | None
     """How pairs fit; None if no pair has a match."""
     evidence: ModelEvidence
@@ -44,7 +44,7 @@ def of_alike_pictures(findings: Iterable[Reason]) -> Iterator[Reason]:
     yield from (replace(one, grade=min(one.grade, Grade.LOOK, key=list(Grade).index)) for one in findings)
 
 
-def reasons_against(model: Standing) -> Iterator[Reason]:
+def reasons_against(model: CheckedModel) -> Iterator[Reason]:
     """Yield what speaks against a model; a weak camera that stands where another model has it is right."""
     fits, evidence, centers = model.fits, model.evidence, model.images.centers
     if np.ptp(centers, axis=0).max() <= _ROUNDING * np.abs(centers).max():
@@ -70,7 +70,7 @@ def reasons_against(model: Standing) -> Iterator[Reason]:
         yield of_model(Kind.INPUT, clause)
 
 
-def _none_agrees(fits: PairFits, model: Standing) -> Iterator[Reason]:
+def _none_agrees(fits: PairFits, model: CheckedModel) -> Iterator[Reason]:
     """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
     if (against := int(fits.contradicts.sum())) and not fits.agrees.any():
         whose = ARE_ITS_PICTURES if model.is_matched_here else IS_ITS_DATABASE
