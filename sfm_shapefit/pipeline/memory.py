@@ -47,13 +47,13 @@ _BLOCK = 9  # entries of a block of the factor; three coordinates by three
 _OBSERVATIONS_OF_A_MATCH = 0.7  # observations for a match, if keypoints are more; .45 to .66 measured
 _OBSERVATION_BYTES = 420.0  # bytes of an observation; its track, and its part of the normal equations
 _DIVIDED_BYTES = 270.0  # the same where adjustments are divided: a part has normal equations at a time
-_KEPT_BYTES, _ENTRY_BYTES = 60.0, 150.0  # bytes of an observation of few tracks, and of its linearization
+_KEPT_BYTES, _ENTRY_BYTES = 60.0, 150.0  # bytes of an observation of few tracks; with its point, linearized
 _OVERSHOT = 1.2  # observations of few tracks for each that an image wants; 1.13 measured
 _THIN_PAIRS, _THIN_FACTOR = 1.9, 1.8
-"""Pairs of cameras that meet in few tracks, for each of the graph, and blocks of their factor, likewise."""
-_ITERATIVE_BYTES = 30e3  # bytes of a camera in the preconditioner
+"""Pairs of cameras that meet in few tracks, for each of the graph; blocks of their factor, likewise."""
+_ITERATIVE_BYTES = 30e3  # bytes of a camera; the factors of its blocks in the preconditioner
 _AVERAGED_BLOCKS, _AVERAGED_FACTORS = 10.0, 1.2
-"""Blocks that averaging holds for each pair, and for each block of the factor."""
+"""Blocks that averaging holds for each pair; for each block of the factor too, with its update matrices."""
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000  # unknowns of an adjusted camera; up to as many, their system is dense
 
 
@@ -185,10 +185,10 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
         tracks -= in_memory
     seeded = throughout + kept + 300.0 * work.num_edges + tracks
     if work.averages:
-        peaks["triangulating a first placement"] = seeded - rays
+        few, solving = _first_placement_bytes(work, plan)
         given_up = in_memory if work.num_matches > MOST_BESIDE_TRACKS else 0.0
-        adjusting = _first_placement_bytes(work, plan)
-        peaks["adjusting a first placement"] = throughout - rays - given_up + adjusting
+        peaks["triangulating a first placement"] = seeded - rays + few
+        peaks["adjusting a first placement"] = throughout - rays - given_up + few + solving
     if work.adjusts_bundle or (work.adjusts and plan.adjustment):
         observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches)
         size = _DIVIDED_BYTES if plan.divides else _OBSERVATION_BYTES
@@ -198,22 +198,20 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
     return peaks
 
 
-def _first_placement_bytes(work: Workload, plan: MemoryPlan) -> float:
-    """Return the bytes of an adjustment on few tracks: pixels, the system of the cameras, and its factor.
+def _first_placement_bytes(work: Workload, plan: MemoryPlan) -> tuple[float, float]:
+    """Return the bytes of the few tracks that are adjusted, and of the equations and the factor beside these.
 
     Many observations are not linearized while there is a factor; where divided, those of a part alone.
     """
     most = _OVERSHOT * wanted_observations(work.num_images, FINE_TIMES) * work.num_images
     observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches, most)
-    kept, entries = _KEPT_BYTES * observations, _ENTRY_BYTES * observations
-    block = 8.0 * _UNKNOWNS**2
+    kept = _KEPT_BYTES * observations
+    entries, block = _ENTRY_BYTES * observations, 8.0 * _UNKNOWNS**2
     system = 2.0 * block * _THIN_PAIRS * work.num_pairs
     if plan.divides or work.num_images > MOST_WHOLE:
-        return kept + system + _ITERATIVE_BYTES * work.num_images
-    factor = 0.5 * block * _THIN_FACTOR * work.factor_entries  # of 32 bits
-    return kept + (
-        max(entries, system + factor) if observations > MANY_ENTRIES else entries + system + factor
-    )
+        return kept, system + _ITERATIVE_BYTES * work.num_images
+    solving = system + 0.5 * block * _THIN_FACTOR * work.factor_entries  # the factor has numbers of 32 bits
+    return kept, max(entries, solving) if observations > MANY_ENTRIES else entries + solving
 
 
 def _adjusted_cameras_bytes(work: Workload) -> float:
