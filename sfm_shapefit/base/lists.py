@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import AnyArray, IntArray
+from sfm_shapefit.base.arrays import AnyArray, IndexArray, IntArray
 from sfm_shapefit.base.jit import kernel
 
 
@@ -82,7 +82,7 @@ class RowLists(Lists):
     """(m,)"""
 
     @classmethod
-    def by_label(cls, labels: IntArray, count: int = 0) -> "RowLists":
+    def by_label(cls, labels: IndexArray, count: int = 0) -> "RowLists":
         """Return a list for each of `count` labels or more, of the rows (m,) that have it, ascending.
 
         Rows whose label is negative are in none.
