@@ -1,6 +1,5 @@
 """Work shared out among threads, or among the workers of a cluster; answers come in order."""
 
-from asyncio import CancelledError
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -139,6 +138,8 @@ def _answer(future: Any) -> Any:
 @contextmanager
 def _failures_told() -> Iterator[None]:
     """Raise what a cluster raises in one sentence; what the work itself says passes as it is."""
+    from asyncio import CancelledError  # which a run without a cluster has no use for, and loads for long
+
     try:
         yield
     except ShapeFitError:

@@ -12,7 +12,7 @@ from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.adjustment.sources import links_touching
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import normalized, tangent_bases, turned_deg
@@ -82,7 +82,7 @@ def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
     measured = state.measured
     if not adjusted.freedom.holds_rotations or adjusted.is_refined.any() or adjusted.refines_sensors:
         source = source.at(images.turned(adjusted.images))
-        frames = np.unique(images.frame_of[rows])
+        frames = distinct(images.frame_of[rows])
         corrected = frames[np.broadcast_to(adjusted.freedom.singled_out(), len(frames))]
         is_corrected = np.isin(images.frame_of, corrected)
         directions = _measure_again(source, state.directions, is_corrected, options.directions, clock)
@@ -97,7 +97,7 @@ def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
         source=source,
         measured=measured,
         placement=move_cameras(placement, locations),
-        intrinsics=state.intrinsics.after(adjusted, np.unique(images.lens_of[rows])),
+        intrinsics=state.intrinsics.after(adjusted, distinct(images.lens_of[rows])),
         adjustment=adjusted,
         turned_deg=turned_deg(images.rotations, source.images.rotations),
     )

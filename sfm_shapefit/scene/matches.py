@@ -22,6 +22,7 @@ from sfm_shapefit.base.arrays import (
     FloatArray,
     IntArray,
     UInt32Array,
+    distinct,
     hand_back_memory,
 )
 from sfm_shapefit.base.executors import Advance, made_ahead, nobody
@@ -311,7 +312,7 @@ class View:
         """Return all pairs, in their order, in parts of about equally many matches; see `Matches.parts`."""
         totals = offsets_of(self._counts)
         count = max(-(-int(totals[-1]) // max(max_matches, 1)), 1)
-        bounds = np.unique(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
+        bounds = distinct(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
         bounds[-1] = len(totals) - 1
         return self.matches.parts(self, [slice(*ends) for ends in itertools.pairwise(bounds.tolist())])
 
@@ -326,7 +327,7 @@ class View:
 
     def _batches(self, chosen: IntArray, min_matches: int) -> Iterator[MatchBatch]:
         for found in self._links(chosen, min_matches):
-            self._keep_rays(np.unique(found.pairs))
+            self._keep_rays(distinct(found.pairs))
             rows = found.spread(self._begins[found.pairs]) + found.keypoints
             yield MatchBatch(
                 pairs=found.pairs,
@@ -346,7 +347,7 @@ class View:
 
     def _keypoint_batch(self, chosen: IntArray, min_matches: int) -> KeypointMatches:
         pairs = self.pairs[chosen]
-        all_see = all(self._blind_of(image) is None for image in np.unique(pairs).tolist())
+        all_see = all(self._blind_of(image) is None for image in distinct(pairs).tolist())
         counts, keypoints = self.matches.read(self.rows[chosen], keep=self.reading.keeps)
         if not all_see:
             has_ray = np.ones(len(keypoints), dtype=np.bool_)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, stable_order
 from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
@@ -132,7 +132,7 @@ class MatchedKeypoints:
             _join(self.matches[first : first + _MATCHES_A_SLICE], given, parents, threads)
         track = number_trees(parents, np.arange(len(parents), dtype=np.int32))
         del parents  # before what orders the keypoints, which is larger
-        rows, lengths = np.argsort(track, kind="stable"), np.bincount(track)
+        rows, lengths = stable_order(track), np.bincount(track)
         del track
         rows, lengths = rows[np.repeat(lengths > 1, lengths)], lengths[lengths > 1]
         return RowLists(offsets_of(lengths), rows)
