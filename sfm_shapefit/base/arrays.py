@@ -66,8 +66,7 @@ def stable_order(labels: npt.NDArray[np.integer[Any]]) -> IntArray:
 def quantile(values: npt.NDArray[Any], share: float) -> FloatArray:
     """Return what a share in [0, 1] of values (k, ...), k > 0, does not exceed, (...); NaN where one is NaN.
 
-    The bits are those of `np.quantile`, whose first call loads the masked arrays of numpy: a fiftieth of a
-    short run.
+    The bits are those of `np.quantile`, which takes several times as long where values are few.
     """
     last, at = len(values) - 1, share * (len(values) - 1)
     low, high = int(at), min(int(at) + 1, last)

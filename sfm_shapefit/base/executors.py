@@ -2,12 +2,16 @@
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
+import numpy.typing as npt
+
+from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import ShapeFitError
 
 Advance = Callable[[int, int], None]
@@ -41,16 +45,34 @@ def in_ranges(threads: int, count: int, work: Callable[..., object], *given: obj
         pass
 
 
-def made_ahead(threads: int, items: Iterator[Answer]) -> Iterator[Answer]:
-    """Yield items, the next of which another thread makes meanwhile; a single thread is the caller's."""
+def gathered(threads: int, array: npt.NDArray[Any], rows: IntArray, kind: type | None = None) -> Any:
+    """Return array[rows], of another type if wanted; threads share the rows."""
+    found = np.empty((len(rows), *array.shape[1:]), dtype=kind or array.dtype)
+
+    def gather(begin: int, end: int) -> None:
+        found[begin:end] = array[rows[begin:end]]
+
+    in_ranges(threads, len(rows), gather)
+    return found
+
+
+def overlapped(threads: int, work: Callable[[Task], Answer], tasks: Iterable[Task]) -> Iterator[Answer]:
+    """Yield what `work`, which shares itself out among threads, makes of each task, in their order.
+
+    What of one task no thread can share is done beside the next task, of which the caller's thread makes and
+    others work on no more than one ahead. A single thread is the caller's.
+    """
     if threads <= 1:
-        yield from items
+        yield from map(work, tasks)
         return
-    with ThreadPoolExecutor(1) as pool:
-        following = pool.submit(next, items, None)
-        while (item := following.result()) is not None:
-            following = pool.submit(next, items, None)
-            yield item
+    with ThreadPoolExecutor(2) as pool:
+        waiting: deque[Future[Answer]] = deque()
+        for task in tasks:
+            waiting.append(pool.submit(work, task))
+            if len(waiting) == 2:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 class WorkerError(ShapeFitError):

@@ -5,6 +5,7 @@ once, and rotations that the matches know better than whoever gave them.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -135,7 +136,8 @@ def _measure_again(
     used = earlier.pairs[usable]
     others = source.view.pairs[~is_among(source.view.pairs, used)]
     batches = source.view.batches(without=others, advance=clock.advance)
-    again = concatenate([estimate_directions(batch, options, clock.threads) for batch in batches])
+    estimate = partial(estimate_directions, options=options, threads=clock.threads)
+    again = concatenate(list(source.view.measured(batches, estimate, clock.threads)))
     rows = again.usable()
     is_anew = corrected[again.pairs[rows]].any(axis=1)
     taken = {"directions": rows, **dict.fromkeys(_SAID_OF_MATCHES, rows[is_anew])}

@@ -87,9 +87,14 @@ def measure(
                 beside.add(batch, directions)
     else:
         parts = []
-        for batch in source.view.batches(1, without, clock.advance, clock.threads):
-            parts.append(estimate_directions(batch, options, clock.threads))
-            beside.add(batch, parts[-1])
+
+        def estimated(batch: MatchBatch) -> tuple[MatchBatch, PairDirections]:
+            return batch, estimate_directions(batch, options, clock.threads)
+
+        batches = source.view.batches(1, without, clock.advance)
+        for batch, directions in source.view.measured(batches, estimated, clock.threads):
+            parts.append(directions)
+            beside.add(batch, directions)
     if not parts and without is not None:
         raise UnsolvableError("no image that is not fixed shares matches with another; match the new images")
     if not parts:

@@ -9,7 +9,7 @@ matters of a keypoint is the unit ray of its pixel in world axes. So there are t
 
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, TypeVar
@@ -25,7 +25,7 @@ from sfm_shapefit.base.arrays import (
     distinct,
     hand_back_memory,
 )
-from sfm_shapefit.base.executors import Advance, made_ahead, nobody
+from sfm_shapefit.base.executors import Advance, Answer, nobody, overlapped
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
 from sfm_shapefit.scene.images import Images
@@ -240,7 +240,6 @@ class View:
         min_matches: int = 1,
         without: IntArray | None = None,
         advance: Advance = nobody,
-        threads: int = 1,
     ) -> Iterator[MatchBatch]:
         """Yield the matches with rays in world axes, in batches; few matches are kept with these.
 
@@ -248,7 +247,6 @@ class View:
             min_matches: pairs with fewer are left out.
             without: (m, 2) pairs that are left out, too, whatever the order of their images.
             advance: hears of the pairs that are done, while batches are consumed, and of their number.
-            threads: if several, another one makes the next batch while a batch is consumed.
 
         Raises:
             InputError: as `Matches.read`.
@@ -261,9 +259,13 @@ class View:
         found = self._batches(np.flatnonzero(wanted), min_matches)
         if self.reading.keeps and self.num_matches <= KEPT_MATCHES and without is None:
             found = iter(self._kept.setdefault(min_matches, list(found)))
-        elif self.reading.keeps:
-            found = made_ahead(threads, found)
         return self._tell(found, advance)
+
+    def measured(
+        self, batches: Iterator[MatchBatch], measure: Callable[[MatchBatch], Answer], threads: int
+    ) -> Iterator[Answer]:
+        """Yield what is measured of batches, see `overlapped`; where memory is short, of one at a time."""
+        return overlapped(threads if self.reading.keeps else 1, measure, batches)
 
     def links(
         self,

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, stable_order
-from sfm_shapefit.base.executors import in_ranges
+from sfm_shapefit.base.executors import gathered, in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
@@ -137,15 +137,14 @@ class MatchedKeypoints:
         rows, lengths = rows[np.repeat(lengths > 1, lengths)], lengths[lengths > 1]
         return RowLists(offsets_of(lengths), rows)
 
-    def observed(self, joined: RowLists) -> ObservedTracks:
+    def observed(self, joined: RowLists, threads: int = 1) -> ObservedTracks:
         """Return tracks that are known by their rows."""
-        rows = joined.rows
         return ObservedTracks(
             offsets=joined.offsets,
-            cameras=self.cameras[rows].astype(np.int64),
-            keypoints=self.keypoints[rows].astype(np.int64),
-            pixels=self.pixels[rows].astype(np.float64),
-            on_plane=self.on_plane[rows],
+            cameras=gathered(threads, self.cameras, joined.rows, np.int64),
+            keypoints=gathered(threads, self.keypoints, joined.rows, np.int64),
+            pixels=gathered(threads, self.pixels, joined.rows, np.float64),
+            on_plane=gathered(threads, self.on_plane, joined.rows),
             ids=np.arange(len(joined.offsets) - 1),
         )
 
