@@ -9,9 +9,8 @@ from itertools import pairwise
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.arrays import AnyArray, IntArray
 from sfm_shapefit.base.errors import ShapeFitError
 
 Advance = Callable[[int, int], None]
@@ -45,9 +44,9 @@ def in_ranges(threads: int, count: int, work: Callable[..., object], *given: obj
         pass
 
 
-def gathered(threads: int, array: npt.NDArray[Any], rows: IntArray, kind: type | None = None) -> Any:
-    """Return array[rows], of another type if wanted; threads share the rows."""
-    found = np.empty((len(rows), *array.shape[1:]), dtype=kind or array.dtype)
+def gathered(threads: int, array: AnyArray, rows: IntArray) -> AnyArray:
+    """Return array[rows]; threads share the rows."""
+    found: AnyArray = np.empty_like(array, shape=(len(rows), *array.shape[1:]))
 
     def gather(begin: int, end: int) -> None:
         found[begin:end] = array[rows[begin:end]]

@@ -6,7 +6,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, stable_order
+from sfm_shapefit.base.arrays import (
+    BoolArray,
+    FloatArray,
+    IndexArray,
+    Int32Array,
+    IntArray,
+    stable_order,
+)
 from sfm_shapefit.base.executors import gathered, in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
@@ -37,11 +44,11 @@ class ObservedTracks(Lists):
 
     offsets: IntArray
     """(t + 1,)"""
-    cameras: IntArray
+    cameras: IndexArray
     """(m,) the camera of each observation."""
-    keypoints: IntArray
+    keypoints: IndexArray
     """(m,) which of the camera's keypoints it is."""
-    pixels: FloatArray
+    pixels: npt.NDArray[np.floating]
     """(m, 2) as the adjustment's lens takes them."""
     on_plane: FloatArray
     """(m, 2) x/z and y/z of the ray in axes of the camera; NaN for rays that do not point ahead."""
@@ -59,7 +66,7 @@ class ObservedTracks(Lists):
         """Return the given tracks, in that order."""
         return self._of_rows(self.rows_of(chosen), self.ids[chosen])
 
-    def of_points(self, points_seen: IntArray) -> "ObservedTracks":
+    def of_points(self, points_seen: IndexArray) -> "ObservedTracks":
         """Return the tracks of points, one each: what observations (m,) see, -1 for those to be left out."""
         if np.array_equal(points_seen, self.list_of_rows()):
             return replace(self, ids=np.arange(self.num_tracks))  # as of matches, and large
@@ -141,9 +148,9 @@ class MatchedKeypoints:
         """Return tracks that are known by their rows."""
         return ObservedTracks(
             offsets=joined.offsets,
-            cameras=gathered(threads, self.cameras, joined.rows, np.int64),
-            keypoints=gathered(threads, self.keypoints, joined.rows, np.int64),
-            pixels=gathered(threads, self.pixels, joined.rows, np.float64),
+            cameras=gathered(threads, self.cameras, joined.rows),
+            keypoints=gathered(threads, self.keypoints, joined.rows),
+            pixels=gathered(threads, self.pixels, joined.rows),
             on_plane=gathered(threads, self.on_plane, joined.rows),
             ids=np.arange(len(joined.offsets) - 1),
         )

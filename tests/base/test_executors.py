@@ -74,8 +74,8 @@ def test_two_tasks_are_in_work_at_once_where_there_are_threads():
 @pytest.mark.parametrize("threads", [1, 3])
 def test_gathered_rows_are_those_of_the_array(threads):
     array, rows = np.arange(30, dtype=np.int32).reshape(10, 3), np.array([9, 0, 0, 4])
-    found = gathered(threads, array, rows, np.int64)
-    assert found.dtype == np.int64
+    found = gathered(threads, array, rows)
+    assert found.dtype == array.dtype
     np.testing.assert_array_equal(found, array[rows])
     assert gathered(threads, array, rows[:0]).shape == (0, 3)
 
