@@ -24,8 +24,7 @@ from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray, distinct, frozen
 from sfm_shapefit.base.geometry import normalized, tangent_bases
 from sfm_shapefit.base.jit import inner_kernel, kernel
-from sfm_shapefit.base.lists import group_by
-from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.laplacian.operators import Workers, group_by
 from sfm_shapefit.scene.lens import NUM_VALUES, PARTS, Lens
 
 SLOTS = 6  # unknowns of a node at most; a frame has six, a lens no more

@@ -2,35 +2,16 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import AnyArray, IndexArray, IntArray
-from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.arrays import AnyArray, IndexArray, IntArray, stable_order
 
 
 def offsets_of(lengths: npt.ArrayLike) -> IntArray:
     """Return where lists of some lengths (k,) begin in their table, and the end of the last, (k + 1,)."""
     return np.append(0, np.cumsum(lengths, dtype=np.int64))
-
-
-@kernel
-def group_by(labels: Any, count: int) -> Any:
-    """Sort items by their labels 0..count-1; return where each label begins, (count + 1,), and the items.
-
-    Items of one label stay in their order.
-    """
-    pointers, items = np.zeros(count + 1, np.int64), np.empty(len(labels), np.int64)
-    for k in range(len(labels)):
-        pointers[labels[k]] += 1
-    for label in range(count):
-        pointers[label + 1] += pointers[label]
-    for k in range(len(labels) - 1, -1, -1):
-        pointers[labels[k]] -= 1
-        items[pointers[labels[k]]] = k
-    return pointers, items
 
 
 class Lists:
@@ -87,9 +68,8 @@ class RowLists(Lists):
 
         Rows whose label is negative are in none.
         """
-        ranked = np.maximum(np.asarray(labels, dtype=np.int64), -1) + 1  # 0: in no list
-        offsets, rows = group_by(ranked, max(count, int(ranked.max(initial=0))) + 1)
-        return cls(offsets[1:] - offsets[1], rows[offsets[1] :])
+        rows = stable_order(labels)[np.sum(labels < 0) :]
+        return cls(offsets_of(np.bincount(labels[rows], minlength=count)), rows)
 
     def __iter__(self) -> Iterator[IntArray]:
         """Return the rows of each list in turn."""

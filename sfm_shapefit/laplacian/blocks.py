@@ -3,8 +3,7 @@
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.lists import group_by
-from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.operators import adjacency, group_by
 
 # METIS takes whole weights, and adds all of them up in 32 bits. Finer ones cut no better.
 _LARGEST_WEIGHT, _LARGEST_SUM = 1e3, 2.0**29

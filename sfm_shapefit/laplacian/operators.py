@@ -21,7 +21,6 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.base.lists import group_by
 from sfm_shapefit.base.threads import count_threads
 
 
@@ -61,6 +60,23 @@ def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
     pointers, entries = group_by(ends, num_nodes)
     neighbors = ends[entries ^ 1].astype(np.int32)  # the other end of the same edge
     return Adjacency(frozen(pointers), frozen(neighbors), frozen((entries // 2).astype(np.int32)))
+
+
+@kernel
+def group_by(labels: Any, count: int) -> Any:
+    """Sort items by their labels 0..count-1; return where each label begins, (count + 1,), and the items.
+
+    Items of one label stay in their order.
+    """
+    pointers, items = np.zeros(count + 1, np.int64), np.empty(len(labels), np.int64)
+    for k in range(len(labels)):
+        pointers[labels[k]] += 1
+    for label in range(count):
+        pointers[label + 1] += pointers[label]
+    for k in range(len(labels) - 1, -1, -1):
+        pointers[labels[k]] -= 1
+        items[pointers[labels[k]]] = k
+    return pointers, items
 
 
 def even_ranges(starts: IntArray, count: int) -> list[tuple[int, int]]:

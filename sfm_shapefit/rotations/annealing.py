@@ -26,9 +26,8 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.forests import connected_components, merge_sets, root_of
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.base.lists import group_by
 from sfm_shapefit.base.quaternions import matrices_of, quaternions_of
-from sfm_shapefit.laplacian.operators import Adjacency, adjacency
+from sfm_shapefit.laplacian.operators import Adjacency, adjacency, group_by
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.rotations.averaging_kernels import (
     close_triangles,

@@ -11,7 +11,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.forests import compact, merge_sets, roots
 from sfm_shapefit.base.jit import inner_kernel, kernel
-from sfm_shapefit.base.lists import group_by
+from sfm_shapefit.laplacian.operators import group_by
 
 _GROWTH_ROUNDS = 4  # rounds; a later one rarely unites anything, and the pebble game is exact anyway
 
