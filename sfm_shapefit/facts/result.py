@@ -130,7 +130,7 @@ class _Placed(Written, Tabled):
     def told(self: Any) -> Telling:
         """What the terminal says."""
         left_out = reasons_by_place(self.not_placed, self.cameras.columns["name"].tolist())
-        told: Telling = self.facts.told(left_out, self.placement.refined.statement())
+        told: Telling = self.facts.told(left_out, self.placement.refined.finish.statement())
         return told
 
     @property

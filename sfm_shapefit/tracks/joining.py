@@ -43,6 +43,13 @@ def sampson_px(a: Any, b: Any, d: Any, pixel_angle: float) -> float:
 
 
 @kernel
+def write_sampson_px(rays_a: Any, rays_b: Any, directions: Any, pixel_angles: Any, errors: Any) -> None:
+    """Write the Sampson errors (m,) in pixels of unit rays (m, 3) against unit directions (m, 3)."""
+    for m in range(len(errors)):
+        errors[m] = sampson_px(rays_a[m], rays_b[m], directions[m], pixel_angles[m])
+
+
+@kernel
 def _number_trees(parents: Any, order: Any, numbers: Any) -> int:
     """Write the number of the tree of each node by the first node of it in `order`; return how many."""
     count = 0
