@@ -103,7 +103,6 @@ def check_command(
         from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.inputs import choose_inputs
-        from sfm_shapefit.pipeline.lengths import judge_bars
 
         known = choose_inputs(source, database).database
         if second_opinion is not None and no_second_opinion:
@@ -115,7 +114,11 @@ def check_command(
                 read_source(source, database)  # what is wrong with that is said first
             refuse_file(report, overwrite=overwrite, protect=inputs)
         plan = () if known is None or no_second_opinion else PLANS["MODEL with a database"]
-        bars = None if scale_bars is None else judge_bars(source, scale_bars)
+        bars = None
+        if scale_bars is not None:
+            from sfm_shapefit.pipeline.lengths import judge_bars
+
+            bars = judge_bars(source, scale_bars)
         with (
             claimed_output(second_opinion, overwrite=overwrite, protect=inputs)
             if second_opinion

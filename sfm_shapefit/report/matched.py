@@ -12,9 +12,9 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.report.drawing import MAX_PAIRS, Cameras, Pairs
+from sfm_shapefit.scene.epipolar import sampson_errors_px
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, View, rows_of_pairs
-from sfm_shapefit.tracks.joining import write_sampson_px
 
 MOST_DRAWN = 32
 """Matches of a pair that are drawn; with more, lines hide the pictures."""
@@ -88,9 +88,7 @@ def _sampson_px(batch: MatchBatch, images: Images) -> FloatArray:
     """
     baselines = images.centers[batch.pairs[:, 1]] - images.centers[batch.pairs[:, 0]]
     directions, angles = batch.spread(normalized(baselines)), batch.spread(batch.pixel_angles)
-    errors = np.empty(len(angles))
-    write_sampson_px(batch.rays_i, batch.rays_j, directions, angles, errors)
-    return errors
+    return sampson_errors_px(batch.rays_i, batch.rays_j, directions, angles)
 
 
 def _most_telling(counts: IntArray, cameras: IntArray, num_cameras: int) -> IntArray:

@@ -11,7 +11,8 @@ from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
-from sfm_shapefit.tracks.joining import number_trees, sampson_px, write_ray
+from sfm_shapefit.scene.epipolar import sampson_px, write_ray
+from sfm_shapefit.tracks.joining import number_trees
 
 # Between two slices Python can be interrupted: about 200 ms. For each all keypoints are counted.
 _MATCHES_A_SLICE = 4_000_000

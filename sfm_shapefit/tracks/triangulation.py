@@ -26,7 +26,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.lists import RowLists, offsets_of
-from sfm_shapefit.tracks.joining import write_ray
+from sfm_shapefit.scene.epipolar import write_ray
 from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTracks
 
 # Observations between which Python can be interrupted: about 0.1 s.

@@ -22,7 +22,8 @@ from sfm_shapefit.solver.program import (
     objective,
     scale_functional,
 )
-from sfm_shapefit.solver.solver_options import IterationInfo
+from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.solver_options import IterationInfo, SolverOptions, Status
 from tests.problems import draw_graph, shape
 
 TOL = 1e-8
@@ -212,6 +213,25 @@ def test_graphs_begun_in_single_precision_are_recovered_to_rounding():
     graph, truth = draw_graph(67, n=160, p=0.15, q=0.1)  # 480 unknowns: it begins in single precision
     t, _ = solved(graph, tol=1e-13)
     assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
+
+
+def test_where_single_precision_stalls_double_precision_ends():
+    """Cameras in a row, each with the next three: 480 unknowns, and the row bends at hardly any cost."""
+    rng, n = np.random.default_rng(1), 160
+    t = np.column_stack([np.arange(n), 0.3 * rng.standard_normal((n, 2))])
+    edges = np.array([(i, j) for i in range(n) for j in range(i + 1, min(n, i + 4))])
+    noise = 1e-3 * rng.standard_normal((len(edges), 3))
+    graph = ViewGraph(n, edges, normalized(normalized(t[edges[:, 0]] - t[edges[:, 1]]) + noise))
+    calls = []
+
+    def watch(info):  # without double precision steps would go on for ever, each from where it began
+        calls.append(info.iteration)
+        return len(calls) < 60
+
+    solver = SolverOptions(solver="newton", tol=1e-10, max_iterations=100)
+    found = solve(graph, solver, on_iteration=watch)
+    assert found.status is Status.CONVERGED
+    assert found.gap < 1e-10
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
