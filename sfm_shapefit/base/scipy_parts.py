@@ -13,7 +13,7 @@ from types import ModuleType
 
 
 def compiled_module(package: str, name: str) -> ModuleType:
-    """Return a module of a package of scipy, such as "scipy.linalg" and "cython_blas".
+    """Return a compiled module of a package of scipy, such as "scipy.linalg" and "cython_blas".
 
     Raises:
         ImportError: if scipy has none of that name.
@@ -45,7 +45,7 @@ def _functions(package: str, name: str, public: str) -> ModuleType:
 
 
 _special = _functions("scipy.special", "_ufuncs", "scipy.special")
-_lapack = _functions("scipy.linalg", "lapack", "scipy.linalg.lapack")
+_lapack = _functions("scipy.linalg", "_flapack", "scipy.linalg.lapack")
 
 expit, logit, gammaln, chdtri = _special.expit, _special.logit, _special.gammaln, _special.chdtri
 xlogy = _special.xlogy

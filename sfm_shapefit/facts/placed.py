@@ -24,6 +24,7 @@ from sfm_shapefit.facts.tables import CameraRow, Table
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.placement.place import Placement, count_large
+from sfm_shapefit.placement.right_pairs import TakenForRight
 from sfm_shapefit.refinement.starts import Finish
 from sfm_shapefit.solver.solver_options import Solve, Status
 
@@ -366,18 +367,6 @@ class GraphInputs(InputFacts):
     def path(self) -> str:
         """Path of the graph."""
         return self.graph
-
-
-class TakenForRight(Record):
-    """What is certain if the pairs that the answer takes for right are right."""
-
-    statement: Annotated[str, "All of it in a sentence."]
-    num_right: Annotated[int, "Pairs of the largest piece whose posterior in pairs.csv is above one half."]
-    num_fixed: Annotated[int, "Nodes of the largest piece that these pairs alone make parallel rigid."]
-    rigid: Annotated[bool, "Whether these are all nodes that are placed."]
-    solve: Annotated[
-        Solve | None, "The certified program restricted to these pairs; null where they are not rigid."
-    ]
 
 
 class GraphFacts(PlacedFacts):

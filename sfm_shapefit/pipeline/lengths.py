@@ -94,7 +94,6 @@ def length_between(
 
 
 def _errors_of(images: Images, points: Points, estimate: Estimate, chosen: IntArray) -> PlaceErrors:
-    """Return the errors of some points of a model, by their rows."""
     rows = np.flatnonzero(images.is_posed)
     observed = points.rows_of(chosen)
     seen = observed.list_of_rows(), np.searchsorted(rows, points.images[observed.rows])

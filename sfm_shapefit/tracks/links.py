@@ -159,7 +159,6 @@ def _join(matches: npt.NDArray[np.integer], given: Any, parents: Int32Array, thr
 
 @kernel
 def _merge(matches: Any, chosen: Any, parents: Any) -> None:
-    """Join the keypoints of the chosen matches."""
     for m in range(len(matches)):
         if chosen[m]:
             merge_sets(parents, matches[m, 0], matches[m, 1])

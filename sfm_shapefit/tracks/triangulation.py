@@ -194,7 +194,6 @@ def _triangulate_joined(
 
 
 def _concatenate(parts: Sequence[RowLists]) -> RowLists:
-    """Return the lists of all parts."""
     lengths = np.concatenate([part.lengths() for part in parts])
     return RowLists(offsets_of(lengths), np.concatenate([part.rows for part in parts]))
 

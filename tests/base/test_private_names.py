@@ -32,6 +32,10 @@ def scipy_has_ufuncs():
     return import_module("scipy.special._ufuncs").expit(0.0) == 0.5
 
 
+def scipy_has_lapack():
+    return callable(import_module("scipy.linalg._flapack").dpotrs)
+
+
 def scipy_has_superlu():
     return callable(import_module("scipy.sparse.linalg._dsolve._superlu").gstrf)
 
@@ -41,6 +45,7 @@ SEEN = {
     "_get_module_for_linking": ("numba", "0.68.1", numba_links_by_it),
     "_nrt": ("numba", "0.68.1", numba_takes_the_option),
     "_ufuncs": ("scipy", "1.17.1", scipy_has_ufuncs),
+    "_flapack": ("scipy", "1.17.1", scipy_has_lapack),
     "_dsolve._superlu": ("scipy", "1.17.1", scipy_has_superlu),
 }
 """What is used, the package and the version in which it was last seen, and whether it is there."""
