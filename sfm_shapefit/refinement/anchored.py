@@ -92,7 +92,6 @@ class _AnchoredTerms(AngularTerms):
         self._anchors, self._joined = anchors, _join(graph, anchors)
 
     def cost(self, t: FloatArray) -> float:
-        """Return the cost at t, (n, d)."""
         return super().cost(t) + self._anchors_cost(t)
 
     def _anchors_cost(self, t: FloatArray) -> float:
