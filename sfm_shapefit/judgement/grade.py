@@ -17,8 +17,8 @@ Do not use, if any of these holds:
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
 placed but are not in the output, that are kept though their matches make no points, that many pairs
 contradict and no pixels confirm (`witnesses`), or that evidence which the fit did not use names: another
-place, a seam, a wrong lens, a lens, a place or a rig that hardly can be (`lenses`, `flights`, `rig_offsets`). Trust is not low
-where the pixels confirm a camera. Look also, though no camera can be named, if
+place, a seam, a wrong lens, a lens, a place or a rig that hardly can be (`lenses`, `flights`, `rig_offsets`).
+Trust is not low where the pixels confirm a camera. Look also, though no camera can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade
     many rejected pairs agree on a second configuration
@@ -43,7 +43,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.geometry import extent_of
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.judgement.evidence import ModelEvidence, how_far
@@ -140,7 +140,7 @@ def _too_few_agree(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     the cameras agree.
     """
     agreeing, against = evidence.sides
-    joining = 0 < agreeing < len(np.unique(images.frame_of[images.is_posed]))
+    joining = 0 < agreeing < len(distinct(images.frame_of[images.is_posed]))
     if joining and against >= RIVAL_SHARE * agreeing:
         clause = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
         clause = f"{clause}, and only {agreeing} agree{'s' * (agreeing == 1)}, too few to check it"

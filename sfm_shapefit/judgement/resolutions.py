@@ -16,7 +16,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.judgement.conventions import Recognized
 from sfm_shapefit.judgement.evidence import OddImages
-from sfm_shapefit.judgement.limits import CHANCE_SHARE, FITTING_PX
+from sfm_shapefit.judgement.limits import FITTING_PX
 from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.points import Points
@@ -25,6 +25,9 @@ _GROSS_PX = 2.0  # median reprojection error in pixels; smaller ones are no matt
 _VANISHES = 0.25  # largest share of this error that is left at the right scale; noise is less
 _LEAST_CHANGE = 0.01  # relative change of the scale; sizes rounded to whole pixels make less
 _FAR = 0.25  # share of the picture; nearer to its corner, noise counts for more than the scale
+_OUTSIDE = (
+    0.01  # share of observations; features are found inside of pictures, a turn moves 4 % out, or far more
+)
 _MOST_IMAGES = 200  # images that are asked; a median needs no more
 
 
@@ -73,7 +76,7 @@ def recognize_resolution(points: Points, images: Images, pictures: KeypointRays)
 
 
 def find_outside(images: Images, points: Points, pictures: KeypointRays) -> Iterator[OddImages]:
-    """Yield the images of lenses more than 5 % of whose observations are outside the picture."""
+    """Yield the images of lenses more than 1 % of whose observations are outside the picture."""
     outside, every = np.zeros((2, len(images.lenses)))
     for k, rows in enumerate(points.rows_of_images(images.num_images)):
         if len(rows) and images.is_posed[k] and (images.sizes_px[k] > 0).all():
@@ -82,7 +85,7 @@ def find_outside(images: Images, points: Points, pictures: KeypointRays) -> Iter
             outside[images.lens_of[k]] += np.count_nonzero(is_out.any(axis=1))
             every[images.lens_of[k]] += len(rows)
     shares = (outside / np.maximum(every, 1))[images.lens_of]
-    if (odd := np.flatnonzero(images.is_posed & (shares > CHANCE_SHARE))).size:
+    if (odd := np.flatnonzero(images.is_posed & (shares > _OUTSIDE))).size:
         sentence = (
             "keypoints outside the picture, {} % of them: is that of another size, or turned by 90 degrees?"
         )

@@ -25,16 +25,16 @@ from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.model import JoinedFacts
 from sfm_shapefit.facts.placed import UNITS, KeyFigures
 from sfm_shapefit.facts.result import Inputs, LocateResult
+from sfm_shapefit.facts.scale_bars import compare_bars
 from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.lengths import ARBITRARY, compare_bars
 from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
 from sfm_shapefit.pipeline.referee import check_source
-from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.gauge import ARBITRARY, Gauge
 from sfm_shapefit.placement.gauge_options import KnownDistance
 from sfm_shapefit.placement.gauge_rule import gauge_of_distances, resized_gauge
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
@@ -145,7 +145,6 @@ class _Growing:
         """New ids of each piece's points, by the old ones."""
 
     def add(self, done: JoinFacts, piece: ModelPiece, tied: TiedPieces) -> None:
-        """Take in a piece that was joined to one of the group."""
         assert done.join is not None
         world_from = compose(self.group.world_from[done.to_number], done.join.to_from_piece)
         worlds = {**self.group.world_from, done.number: world_from}

@@ -26,6 +26,8 @@ from sfm_shapefit.base.geometry import (
 from sfm_shapefit.placement.prior_readings import better_reading
 from sfm_shapefit.scene.given import EarthDatum, PositionPriors
 
+ARBITRARY = ("input", "unit")
+"""Kinds of scale that give way to known lengths."""
 _CAP_OF_SIZE = 0.5  # spreads of all input centers; one that is farther off is lost and must not set the scale
 _ROUGH = 0.1  # spreads; the scale is rough if the input's centers are off by more, in the median
 _DOUBTFUL = 0.01  # spreads; priors that are off by more are tried in other readings
@@ -202,8 +204,8 @@ def distance_gauge(
         scale_statement=f"distance: {sentence}",
         scale_sigma=sigma if len(distances) > 1 else None,
         warning=(
-            f"the known distances contradict one another, so that the scale is known to {100.0 * sigma:.2g} % only: "
-            f"{names[worst]} miss theirs most, by {residuals[worst]:.3g}"
+            "the known distances contradict one another, so that the scale is known to "
+            f"{100.0 * sigma:.2g} % only: {names[worst]} miss theirs most, by {residuals[worst]:.3g}"
             if sigma > METRIC_SIGMA
             else ""
         ),

@@ -54,7 +54,7 @@ def pull_to_priors(
     known = priors.of(placement.nodes).known
     start = gauge.similarity.apply(refined.locations)
     anchors = _anchor(start, known, np.eye(3) if gauge.axes is None else gauge.axes)
-    levels = np.radians(np.array(refined.levels_deg))
+    levels = np.radians(np.array(refined.finish.levels_deg))
     refine = partial(refine_anchored, part, levels=levels, max_bytes=options.solver.factor_bytes)
     vagueness = 1.0 if _fit_most(anchors, start) else _vagueness(anchors, start)
     moved = refine(start, anchors=_vaguer(anchors, vagueness))
@@ -67,12 +67,8 @@ def pull_to_priors(
     anchors = _vaguer(anchors, vagueness)
     by = float(np.median(np.linalg.norm((moved - start)[: len(placement.cameras)], axis=1)))
     held = anchors.indices[anchors.chi2(moved) <= KERNEL_WIDTH**2]
-    kept = replace(
-        refined,
-        locations=(moved - gauge.similarity.translation) / gauge.similarity.scale,
-        reset_nodes=np.setdiff1d(refined.reset_nodes, held),
-        variances=None,
-    )
+    locations = (moved - gauge.similarity.translation) / gauge.similarity.scale
+    kept = refined.moved_to(locations, np.setdiff1d(refined.reset_nodes, held))
     return Pulled(
         replace_locations(placement, kept),
         replace(gauge, statement=f"{gauge.statement}{PULLED}{by:.3g} (median)"),

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import angle_between, normalized
-from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 from sfm_shapefit.rotations.annealing import (
     LAST_REDUCTION,
     LONGEST_STEP,
@@ -31,6 +31,7 @@ from sfm_shapefit.rotations.annealing import (
     AveragingPairs,
     Linearized,
 )
+from sfm_shapefit.rotations.average import check_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.averaging_kernels import turn_cameras, weigh_blocks
 from sfm_shapefit.rotations.averaging_system import AveragingSystem, plan_system
@@ -137,13 +138,13 @@ def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Re
     turns = np.concatenate([turns, [[0.0, 0.0, 0.0, 1.0]]])
     system = plan_system(graph.num_cameras, graph.pairs, np.sqrt(graph.supports), 1)
     k, m = len(graph.pairs), len(gravity.indices)
-    distances, blocks, gradient = np.empty(k), np.empty((k, 3, 3)), np.empty((graph.num_cameras, 3))
+    distances, blocks, pulls = np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3))
 
     def weigh(scale: float) -> float:
         graph.measured[k - m :] = _follow(turns, gravity)
-        weigh_blocks(
-            graph.pairs, graph.measured, turns, graph.information, float(_LIMIT), scale, distances, blocks,
-            gradient,
+        system.over_pairs(
+            weigh_blocks, graph.pairs, graph.measured, turns, graph.information, float(_LIMIT), scale,
+            distances, blocks, pulls,
         )  # fmt: skip
         inside = distances[: k - m][~np.isnan(distances[: k - m])]
         median = float(np.median(inside)) if len(inside) else 1.0
@@ -151,7 +152,8 @@ def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Re
 
     scale = weigh(weigh(SCALE_OF_MEDIAN))
     for _ in range(_ROUNDS):
-        turned = turn_cameras(turns, system.solve_blocks(blocks, gradient, LAST_REDUCTION), LONGEST_STEP)
+        steps = system.solve_blocks(blocks, system.gradient_of(pulls), LAST_REDUCTION)
+        turned = turn_cameras(turns, steps, LONGEST_STEP)
         scale = weigh(scale)
         if turned <= SETTLED:
             break
@@ -167,8 +169,8 @@ def _join_world(given: AveragingPairs, turns: FloatArray, gravity: Gravity) -> A
     n, k, m = given.num_cameras, len(given.pairs), len(gravity.indices)
     distances, limit = np.empty(k), float(np.radians(AGREEMENT_DEG))
     weigh_blocks(
-        given.pairs, given.measured, turns, given.information, limit, 1.0, distances, np.empty((k, 3, 3)),
-        np.empty((n, 3)),
+        0, k, given.pairs, given.measured, turns, given.information, limit, 1.0, distances,
+        np.empty((k, 3, 3)), np.empty((k, 3)),
     )  # fmt: skip
     agreeing = given.subset(~np.isnan(distances))
     # On average, of a connected graph.
@@ -201,3 +203,13 @@ def _shortest_turns(sources: FloatArray, target: FloatArray) -> Rotation:
     axes[opposite] = np.cross(target, np.eye(3)[int(np.argmin(np.abs(target)))])
     angles = angle_between(sources, np.broadcast_to(target, sources.shape))
     return Rotation.from_rotvec(angles[:, None] * normalized(axes))
+
+
+def refine_with_gravity(
+    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
+) -> AveragedRotations:
+    """Return averaged rotations of frames refined on their pairs and gravities together."""
+    supports = relative.weight_shares * relative.num_matches
+    count = len(averaged.registered)
+    given = check_pairs(relative.pairs, relative.rotations, relative.information, supports, count)
+    return with_gravity(averaged, given, gravity)

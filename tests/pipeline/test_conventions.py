@@ -9,11 +9,11 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import FLIP_YZ, fit_similarity
+from sfm_shapefit.commands.check import check
+from sfm_shapefit.commands.convert import convert
 from sfm_shapefit.judgement.conventions import recognize_convention
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.check import check
-from sfm_shapefit.pipeline.convert import convert
 from tests.models import centers_of, posed
 from tests.scenes import COURTYARD, RING, copied, edit_database
 
@@ -107,7 +107,7 @@ def test_observations_in_another_resolution_are_said_with_their_ratio():
 
 def test_keypoints_of_a_picture_that_is_turned_by_90_degrees_are_told(tmp_path):
     """As where one program follows the orientation in the EXIF data, and another does not."""
-    folder = copied(COURTYARD, tmp_path)
+    folder = copied(RING, tmp_path)
     model, database = pycolmap.Reconstruction(folder / "sparse" / "0"), folder / "database.db"
     (camera,) = model.cameras.values()
 

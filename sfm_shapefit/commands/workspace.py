@@ -31,7 +31,7 @@ from sfm_shapefit.files.colmap.pinholes import Flat, flats_of, flatten_model, ma
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
 from sfm_shapefit.files.undistortion_options import UndistortionOptions
-from sfm_shapefit.pipeline.convert import nerf_files
+from sfm_shapefit.report.mesh import nerf_files
 from sfm_shapefit.rotations.gravity import DOWN, turn_upright
 from sfm_shapefit.scene.level import find_up
 
