@@ -25,9 +25,7 @@ _GROSS_PX = 2.0  # median reprojection error in pixels; smaller ones are no matt
 _VANISHES = 0.25  # largest share of this error that is left at the right scale; noise is less
 _LEAST_CHANGE = 0.01  # relative change of the scale; sizes rounded to whole pixels make less
 _FAR = 0.25  # share of the picture; nearer to its corner, noise counts for more than the scale
-_OUTSIDE = (
-    0.01  # share of observations; features are found inside of pictures, a turn moves 4 % out, or far more
-)
+_OUTSIDE = 0.01  # share of observations; features are found inside, and a turn moves 4 % or more out
 _MOST_IMAGES = 200  # images that are asked; a median needs no more
 
 

@@ -112,12 +112,12 @@ def test_keypoints_of_a_picture_that_is_turned_by_90_degrees_are_told(tmp_path):
     (camera,) = model.cameras.values()
 
     def told():
-        reasons = check(model, database, second_opinion=False).verdict.reasons
-        return [one for one in reasons if "keypoints outside the picture" in one]
+        findings = check(model, database, second_opinion=False).verdict.findings
+        return [one for one in findings if "keypoints outside the picture" in one.sentence]
 
     assert not told()
     width, height = camera.height, camera.width
-    camera.width, camera.height, camera.params = width, height, [1000.0, 0.5 * width, 0.5 * height, 0.0]
+    camera.width, camera.height, camera.params = width, height, [1000.0, 1000.0, 0.5 * width, 0.5 * height]
     values = np.array(camera.params, dtype="<f8").tobytes().hex()
     edit_database(database, f"UPDATE cameras SET width = {width}, height = {height}, params = x'{values}'")
     assert len(told()) == 1
