@@ -25,9 +25,8 @@ from sfm_shapefit.files.colmap.database_pairs import refuse_no_features
 from sfm_shapefit.files.colmap.known import read_known
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
-from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
+from sfm_shapefit.pairs.pair_scores import MOST_SCORED_PAIRS, PairScores, score_pairs
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.inputs import MatchSource, inputs_from, read_left_out, see_matches
 from sfm_shapefit.pipeline.intrinsics import choose_intrinsics
 from sfm_shapefit.pipeline.memory import largest_group, see_within_limit
@@ -42,28 +41,13 @@ from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.sequences import Loop, Videos, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.scene.given import Gravity, Known
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import PairNames, View, rows_of_pairs
-
-_MOST_SCORED_PAIRS = 20_000  # pairs; scores of more are not worth 0.2 ms a pair and 16 bytes a match
+from sfm_shapefit.scene.matches import PairNames, View
 
 # What only unsound pairs, or pairs below `min_matches`, tie to the rest.
 _UNTIED = (
     "no pair that can be believed ties it to the others: their matches are few, fit no one relative pose, or "
     "contradict the rest"
 )
-
-
-class PairScores(NamedTuple):
-    """Scores of pairs with a relative rotation, by which those of repeated structure are told."""
-
-    pairs: IntArray = np.zeros((0, 2), dtype=np.int64)
-    """(m, 2)"""
-    values: FloatArray = np.zeros((0, 2))
-    """(m, 2) by triangles, and the matched share of their overlap; NaN where unknown."""
-
-    def of(self, pairs: IntArray) -> FloatArray:
-        """Return those of some pairs (k, 2), (k, 2)."""
-        return np.vstack([self.values, [np.nan, np.nan]])[rows_of_pairs(pairs, self.pairs)]
 
 
 def start_run(
@@ -169,19 +153,10 @@ class MapContext(NamedTuple):
 
     def score_pairs(self, relative: RelativeRotations) -> "MapContext":
         """Return the run with the scores by which pairs of repeated structure are told."""
-        scores = np.full((len(relative.pairs), 2), np.nan)
-        scores[:, 0] = score_triplets(self.images.num_images, relative)
-        if len(scores) <= _MOST_SCORED_PAIRS:
-            with self.clock("scores of pairs"):
-                view = self.view()
-                pixels = [view.keypoints(k) for k in range(self.images.num_images)]
-                sizes = self.images.sizes_px
-                batches = list(view.links(LEAST_MATCHES))  # both look at all of them
-                partners = count_partners([len(image_pixels) for image_pixels in pixels], batches)
-                for batch in batches:
-                    rows = rows_of_pairs(batch.pairs, relative.pairs)
-                    scores[rows[rows >= 0], 1] = matched_shares(pixels, sizes, partners, batch)[rows >= 0]
-        return self._replace(scores=PairScores(relative.pairs, scores))
+        if len(relative.pairs) > MOST_SCORED_PAIRS:
+            return self._replace(scores=score_pairs(self.images.num_images, relative))
+        with self.clock("scores of pairs"):
+            return self._replace(scores=score_pairs(self.images.num_images, relative, self.view()))
 
     def average_images(
         self, relative: RelativeRotations, reasons: dict[int, str]

@@ -5,7 +5,8 @@ import pytest
 
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.pipeline.components import ComponentAveraging, PairScores
+from sfm_shapefit.pairs.pair_scores import PairScores
+from sfm_shapefit.pipeline.components import ComponentAveraging
 from sfm_shapefit.rotations.averaging_options import AveragingOptions
 from tests.problems import made_rotations
 
