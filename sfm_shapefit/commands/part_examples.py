@@ -1,4 +1,4 @@
-"""Small examples of the parts of commands, each of which compiles what takes long; see `commands.examples`."""
+"""Small examples of the parts of commands that take longest to compile; see `commands.examples`."""
 
 from dataclasses import replace
 from pathlib import Path

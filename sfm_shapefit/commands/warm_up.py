@@ -93,7 +93,8 @@ class WarmUp:
 def warm_up(examples: Sequence[str], report: Tell | None = None) -> WarmUp:
     """Compile the kernels that examples need and keep them on disk, in as many processes as there are cores.
 
-    Examples are names of functions of `commands.examples` or `part_examples`; `report` is called whenever a kernel is ready.
+    Examples are names of functions of `commands.examples` or `part_examples`; `report` is called whenever a
+    kernel is ready.
     """
     if not examples:
         return WarmUp(0, ())

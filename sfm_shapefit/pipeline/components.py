@@ -1,4 +1,4 @@
-"""What all components of a run of `map` share: relative rotations of all images, and averaged ones of each."""
+"""What the components of a run of `map` share: relative rotations of all images, averaged one by one."""
 
 from collections.abc import Iterator
 from dataclasses import replace
