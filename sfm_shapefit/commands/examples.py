@@ -24,7 +24,7 @@ from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.adjustment.solve import adjust
-from sfm_shapefit.commands.part_examples import long_graph, random_graph, small_bundle
+from sfm_shapefit.commands.part_examples import drawn_graph, long_graph, small_bundle
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.bundle import read_bundle
@@ -56,8 +56,8 @@ def measure_pairs(folder: Path) -> None:
 
 def place_graph(_folder: Path) -> None:
     """Place bare graphs with all that follows the solve, also where most pairs are wrong."""
-    place(random_graph(), threads=2)
-    place(random_graph(), objective="lud", threads=2)
+    place(drawn_graph(), threads=2)
+    place(drawn_graph(), objective="lud", threads=2)
     place(synthetic.random_graph_problem(40, 0.6, q=0.8, seed=1).view_graph, threads=2)
 
 
@@ -68,7 +68,7 @@ def place_long_graph(_folder: Path) -> None:
 
 def place_flat_graph(_folder: Path) -> None:
     """Place a graph in two dimensions, and solve it by sparse Newton steps, as large ones are."""
-    graph = random_graph(2)
+    graph = drawn_graph(2)
     place(graph, threads=2)
     solve_newton_sparse(graph, 1e-8, 50)
 

@@ -29,7 +29,7 @@ from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
 
 
-def random_graph(dimension: int = 3, num_nodes: int = 20) -> ViewGraph:
+def drawn_graph(dimension: int = 3, num_nodes: int = 20) -> ViewGraph:
     """Return a graph of drawn edges, a tenth of them wrong."""
     return synthetic.random_graph_problem(num_nodes, 0.6, dimension, sigma=0.02, q=0.1, seed=1).view_graph
 
@@ -41,14 +41,14 @@ def long_graph(num_nodes: int = 300) -> ViewGraph:
 
 def solve_dense(_folder: Path) -> None:
     """Solve graphs by Newton steps: from a rough start, from least squares, and with a float32 factor."""
-    for graph in (random_graph(), long_graph(40), random_graph(num_nodes=160)):
+    for graph in (drawn_graph(), long_graph(40), drawn_graph(num_nodes=160)):
         solve(graph, threads=2)
     solve_newton_dense(long_graph(160), 1e-8, 50)
 
 
 def start_by_lud(_folder: Path) -> None:
     """Solve LUD, as the second start of a placement."""
-    solve_lud(random_graph(), certified=False)
+    solve_lud(drawn_graph(), certified=False)
 
 
 def judge_placement(_folder: Path) -> None:
@@ -78,7 +78,7 @@ def solve_sparse(_folder: Path) -> None:
 
 def solve_by_splitting(_folder: Path) -> None:
     """Solve graphs by splitting, with a factor and without."""
-    for graph in (random_graph(), long_graph(60)):
+    for graph in (drawn_graph(), long_graph(60)):
         solve(graph, solver="admm", threads=2)
         solve(graph, solver="admm", threads=1, factor_memory_mb=0, max_iterations=20)
     solve(long_graph(500), solver="admm", threads=1, max_iterations=20)  # its factor is of float32
@@ -108,7 +108,7 @@ def find_pieces(_folder: Path) -> None:
 
 def average_graphs(_folder: Path) -> None:
     """Average rotations with a factor, and as on large graphs without one."""
-    edges = np.ascontiguousarray(random_graph().edges)
+    edges = np.ascontiguousarray(drawn_graph().edges)
     problem = rotation_problem(20, edges)
     average_relative_rotations(20, problem.relative, threads=2)
     given = check_pairs(edges, problem.relative.rotations, problem.relative.information, None, 20)

@@ -27,7 +27,7 @@ class PairScores(NamedTuple):
         return np.vstack([self.values, [np.nan, np.nan]])[rows_of_pairs(pairs, self.pairs)]
 
 
-def score_pairs(num_images: int, relative: RelativeRotations, view: View | None = None) -> PairScores:
+def score_repetition(num_images: int, relative: RelativeRotations, view: View | None = None) -> PairScores:
     """Return the scores of all pairs of images with a relative rotation, by the matches of a view too.
 
     Without a view, of very many pairs, they are scored by their triangles alone.

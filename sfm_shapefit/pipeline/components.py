@@ -19,7 +19,7 @@ from sfm_shapefit.files.colmap.database_pairs import refuse_no_features
 from sfm_shapefit.files.colmap.known import read_known
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
-from sfm_shapefit.pairs.pair_scores import MOST_SCORED_PAIRS, PairScores, score_pairs
+from sfm_shapefit.pairs.pair_scores import MOST_SCORED_PAIRS, PairScores, score_repetition
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource, inputs_from, read_left_out, see_matches
 from sfm_shapefit.pipeline.intrinsics import choose_intrinsics
@@ -140,9 +140,9 @@ class MapContext(NamedTuple):
     def score_pairs(self, relative: RelativeRotations) -> "MapContext":
         """Return the run with the scores by which pairs of repeated structure are told."""
         if len(relative.pairs) > MOST_SCORED_PAIRS:
-            return self._replace(scores=score_pairs(self.images.num_images, relative))
+            return self._replace(scores=score_repetition(self.images.num_images, relative))
         with self.clock("scores of pairs"):
-            return self._replace(scores=score_pairs(self.images.num_images, relative, self.view()))
+            return self._replace(scores=score_repetition(self.images.num_images, relative, self.view()))
 
     def average_images(
         self, relative: RelativeRotations, reasons: dict[int, str]
