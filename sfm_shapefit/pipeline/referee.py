@@ -16,17 +16,16 @@ to be looked at.
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit import __version__
 from sfm_shapefit.adjustment.sources import collect_tracks
-from sfm_shapefit.base.arrays import BoolArray, distinct
+from sfm_shapefit.base.arrays import distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.facts.check_result import CheckResult, checked_camera_rows, checked_pair_rows
-from sfm_shapefit.facts.map_result import MapResult
+from sfm_shapefit.facts.check_result import CheckResult, OtherModel, checked_camera_rows, checked_pair_rows
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import contradicting
@@ -51,22 +50,6 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.structure import Structure
-
-
-class OtherModel(NamedTuple):
-    """Another model of the same matches, to compare with."""
-
-    images: Images
-    """Where it has the images."""
-    fits: PairFits
-    """How pairs fit it."""
-    doubted: BoolArray
-    """(n,) images that may stand elsewhere by their own matches."""
-    source: MapResult
-    """What it is one of."""
-    number: int
-    """Which of these it is."""
-
 
 _LATER: Any = None
 """In place of what a later stage finds out."""

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.facts.check_result import OtherModel
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -17,7 +18,6 @@ from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.bundle import points_of_pictures
 from sfm_shapefit.pipeline.referee import (
     CheckState,
-    OtherModel,
     compare_with_other,
     finish_check,
     fit_directions,
