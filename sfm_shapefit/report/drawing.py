@@ -16,10 +16,9 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.facts.rows import covariances_of
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting, rejected
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.verdicts import Verdict
-from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.report.lens_residuals import LensField
 from sfm_shapefit.scene.images import Images
 
@@ -320,9 +319,8 @@ def _pairs(rows: Table[PairRow], cameras: Cameras, certified: FloatArray | None)
     ends = np.array([[row_of[name] for name in columns[end]] for end in ("name1", "name2")], dtype=np.int64).T
     directions, undetermined = columns["direction"], columns["verdict"] == Verdict.UNDETERMINED.value
     is_known = np.isfinite(directions).all(axis=1)
-    is_rejected = columns["reason"] == DirectionStatus.LOW_INLIER_RATIO.value
     kinds = PairClass.REJECTED, PairClass.NO_DIRECTION, PairClass.UNDETERMINED, PairClass.CONTRADICTS
-    of_kind = [~is_known & is_rejected, ~is_known, undetermined, contradicting(rows)]
+    of_kind = [~is_known & rejected(rows), ~is_known, undetermined, contradicting(rows)]
     classes = np.select(of_kind, kinds, PairClass.AGREES)
     return Pairs(
         cameras=ends,

@@ -15,17 +15,18 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.structure import Structure
 
-_MOST_FIELDS = 4  # lenses that are shown, those with most images
-_MOST_IMAGES = 150  # images of a lens that are asked, evenly picked; more cost more than they tell
+_MOST_FIELDS = 4  # lenses that are shown; those with most images say most
+_MOST_IMAGES = 150  # images of a lens that are asked, evenly picked; more cost time and add no digit
 _FEWEST_RESIDUALS = 300  # residuals of a lens; fewer show nothing over a whole picture
 _FEWEST_IMAGES = 9  # images of a lens; the signs of fewer have no 1 / _CHANCE combinations
-_IN_A_CELL = 30  # residuals in a cell of the picture, on average
-_SIDE = (4, 16)  # limits of the number of cells along the longer side
+_IN_A_CELL = 30  # residuals in a cell of the picture, on average; their mean is five times as exact as one
+_SIDE = (4, 16)  # limits of the number of cells along the longer side; more arrows hide one another
 _FEWEST_DRAWN = 15  # residuals in a cell; the mean of fewer is noise
 _LARGE = 3.0  # median lengths; longer residuals, as of wrong matches, count as of this length
-_FLIPS, _CHANCE = 999, 0.005  # draws of signs, and the share of them that may show as much of a pattern
+_FLIPS = 999  # draws of signs; the smallest probability that they can show is a thousandth
+_CHANCE = 0.005  # probability of as much of a pattern by chance; a page shows a few lenses, not hundreds
 _OF_NOTE = 0.05  # share of the squared residuals; what a smaller pattern adds to their RMS is below 3 %
-_RINGS = 5  # rings about the principal point, of as many residuals each
+_RINGS = 5  # rings about the principal point, of as many residuals each; a profile may change its sign
 
 
 class LensField(NamedTuple):
