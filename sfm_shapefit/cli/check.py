@@ -98,12 +98,12 @@ def check_command(
             raise typer.Exit(EXIT_UNSOLVABLE if strict and not is_usable else 0)
         refuse_no_model(source)
         from sfm_shapefit.base.atomic_folder import claimed_output
+        from sfm_shapefit.commands.check import check
+        from sfm_shapefit.commands.lengths import judge_bars
+        from sfm_shapefit.commands.write import refuse_file
         from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
-        from sfm_shapefit.pipeline.check import check
         from sfm_shapefit.pipeline.inputs import choose_inputs
-        from sfm_shapefit.pipeline.lengths import judge_bars
-        from sfm_shapefit.pipeline.write import refuse_file
 
         known = choose_inputs(source, database).database
         if second_opinion is not None and no_second_opinion:
@@ -186,8 +186,8 @@ def _check_pieces(
     folder: Path, database: Path | None, second_opinion: bool, *, as_json: bool, quiet: bool
 ) -> bool:
     """Judge the models in a folder, print one table, and return whether one of them is to be kept."""
+    from sfm_shapefit.commands.check import check_pieces
     from sfm_shapefit.files.colmap.quiet import hear_pycolmap
-    from sfm_shapefit.pipeline.check import check_pieces
 
     with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
         found = check_pieces(folder, database, second_opinion=second_opinion, progress=progress)

@@ -93,9 +93,9 @@ def evaluate_command(
     with report_errors():
         from sfm_shapefit.base.atomic_folder import atomic_file
         from sfm_shapefit.base.paths import refuse_absent
+        from sfm_shapefit.commands.evaluate import evaluate, evaluate_against_table
+        from sfm_shapefit.commands.write import refuse_file
         from sfm_shapefit.facts.tables import write_records
-        from sfm_shapefit.pipeline.evaluate import evaluate, evaluate_against_table
-        from sfm_shapefit.pipeline.write import refuse_file
 
         if csv is not None:
             refuse_absent(source, truth)
@@ -121,7 +121,7 @@ def _tell_lengths(source: Path, lengths: list[str], bars: Path | None, *, as_jso
     """Print how well lengths of a model are known."""
     with report_errors():
         from sfm_shapefit.base.paths import refuse_absent
-        from sfm_shapefit.pipeline.lengths import evaluate_lengths
+        from sfm_shapefit.commands.lengths import evaluate_lengths
 
         refuse_absent(source, *filter(None, [bars]))
         found = evaluate_lengths(source, [split_values("length", one) for one in lengths], scale_bars=bars)

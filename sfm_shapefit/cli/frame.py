@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Generic
 import typer
 
 from sfm_shapefit.base.display import row
+from sfm_shapefit.base.paths import OF_DATABASE, SOLVED
 from sfm_shapefit.base.settings import S, flat_values
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.cli.console import (
@@ -24,7 +25,6 @@ from sfm_shapefit.cli.console import (
 from sfm_shapefit.cli.flags import OutputFlags, read_options
 from sfm_shapefit.cli.forecast import PLANS
 from sfm_shapefit.cli.progress import show_progress
-from sfm_shapefit.facts.command_options import FIX_SOLVED
 from sfm_shapefit.files.matching_options import MADE_FIRST
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     Result = LocateResult | MapResult | GraphResult | JoinedModel
 
 _BLACK = "the points have none; --images FOLDER gives them those of the images"
-_IN_PLACE_OF_FILES = {"database", FIX_SOLVED}
+_IN_PLACE_OF_FILES = {OF_DATABASE, SOLVED}
 """Words that options take where else they take a file."""
 _NOTICED_S = 1.0  # seconds; a user does not notice less compiling
 
@@ -61,7 +61,7 @@ class Run(Generic[S]):
 
         The command ends with exit code 4, if that was asked for and the model is not to be used.
         """
-        from sfm_shapefit.pipeline.write import WriteOptions, deliver
+        from sfm_shapefit.commands.write import WriteOptions, deliver
 
         flags = self.flags
         how: dict[str, Any] = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
@@ -76,7 +76,7 @@ class Run(Generic[S]):
 
     def _tell(self, found: "Result", source: Path, out: Path) -> None:
         """Print the details if they are wanted, the answer, the verdict, and what to do next."""
-        from sfm_shapefit.pipeline.write import has_colors
+        from sfm_shapefit.commands.write import has_colors
 
         told, pages = found.told, [str(out / folder / "report.html") for folder in found.told.folders]
         if self.flags.verbose:
