@@ -36,7 +36,7 @@ from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.scale_bars import MeasuredBars
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table, contradicting
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.points import structure_of
+from sfm_shapefit.files.colmap.points import ModelKeypoints, structure_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
