@@ -21,6 +21,7 @@ const data = decode(JSON.parse($("data").textContent));
 const { cameras, pairs, points } = data;
 const numCameras = cameras.names.length;
 const numPairs = pairs.first.length;
+const isGood = data.banner.grade === "good";
 // Of pairs: how many matches fit and contradict, how many of either are drawn, and the row of the first of these.
 const matches = new Map();
 if (data.matches) {

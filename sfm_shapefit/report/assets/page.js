@@ -51,7 +51,6 @@ const drawFacts = () => {
   }));
   fill("summary", ...data.summary.map((text) => element("li", text)));
   fill("expert-facts", ...data.expertFacts.map((text) => element("li", text)));
-  const isGood = data.banner.grade === "good";
   if (isGood) $("looks-title").textContent = "Of note";
   const looks = data.looks.map(({ text, camera, pair }) => {
     const item = element("li", "", isGood ? "fine" : "");

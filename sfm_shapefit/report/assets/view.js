@@ -3,6 +3,7 @@
 const MANY_PAIRS = 200; // with more, agreeing pairs are not drawn until asked for
 const MANY_WITHOUT_POINTS = 1000; // where they hide nothing
 const MANY_WRONG = 100; // contradicting pairs, long lines across the scene
+const MANY_SET_ASIDE = 20; // the same where the verdict is good
 const MANY_REJECTED = 20;
 const MOST_PAIRS = 4000;
 const FAR_DEG = 1; // pairs that contradict by less are not drawn either
@@ -192,8 +193,8 @@ const makeScene = (onChoice) => {
     const said = `Pairs ${["that agree", "that contradict", "that cannot be judged", "without a direction", "rejected"][verdict]}`;
     const amount = drawn.length === total ? count(total) : `${count(drawn.length)} of ${count(total)}`;
     const limit = verdict === 0 ? (points.positions.length ? MANY_PAIRS : MANY_WITHOUT_POINTS)
-      : verdict === 1 ? MANY_WRONG : verdict === 4 ? MANY_REJECTED : MOST_PAIRS;
-    const shown = drawn.length <= limit && verdict !== 3 && (verdict !== 4 || data.banner.grade !== "good") && (verdict !== 1 || drawn.some((p) => pairs.residual[p] >= FAR_DEG));
+      : verdict === 1 ? (isGood ? MANY_SET_ASIDE : MANY_WRONG) : verdict === 4 ? MANY_REJECTED : MOST_PAIRS;
+    const shown = drawn.length <= limit && verdict !== 3 && (verdict !== 4 || !isGood) && (verdict !== 1 || drawn.some((p) => pairs.residual[p] >= FAR_DEG));
     const order = spread(drawn.length).map((k) => drawn[k]);
     addLayer(name, `${said} (${amount})`, shown, {
       variable: VARIABLES[verdict], pairs: order, segments: painter.shapes(SEGMENT, pairColumns(order)),
