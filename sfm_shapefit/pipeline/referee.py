@@ -23,7 +23,7 @@ import numpy as np
 from sfm_shapefit import __version__
 from sfm_shapefit.adjustment.sources import collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate
-from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.arrays import BoolArray, distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.check_result import CheckResult, checked_camera_rows, checked_pair_rows
@@ -225,7 +225,7 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
         loose_groups=[],
         versions={"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
         mean_reprojection_error_px=float(errors_px.mean()) if len(errors_px) else np.nan,
-        num_lenses=len(np.unique(state.images.lens_of)),
+        num_lenses=len(distinct(state.images.lens_of)),
         median_track_length=_median(quality.point_track_lengths.tolist()),
         residual_level_deg=np.nan if fits is None else fits.level_deg,
         timings_s=clock.seconds,
