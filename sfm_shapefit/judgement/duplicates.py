@@ -64,7 +64,6 @@ def _depths(images: Images, points: Points) -> FloatArray:
 def _find_duplicates(
     images: Images, pictures: KeypointRays, pairs: IntArray, view: View, threads: int
 ) -> IntArray:
-    """Return those of some pairs (k, 2) that are near duplicates."""
     found = [np.zeros((0, 2), dtype=np.int64)]
     for batch in view.links(chosen=is_among(view.pairs, pairs)) if len(pairs) else ():
         first, second = (_places(images, pictures, batch, side) for side in (0, 1))

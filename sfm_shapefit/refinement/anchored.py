@@ -92,7 +92,6 @@ class _AnchoredTerms(AngularTerms):
         self._anchors, self._joined = anchors, _join(graph, anchors)
 
     def cost(self, t: FloatArray) -> float:
-        """Return the cost at t, (n, d)."""
         kernels = 0.5 * KERNEL_WIDTH**2 * loss(ARCTANGENT, self._anchors.chi2(t) / KERNEL_WIDTH**2)
         return super().cost(t) + float(np.sum(kernels))
 

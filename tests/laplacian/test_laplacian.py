@@ -1,5 +1,7 @@
 """Sparse linear algebra of graph Laplacians, against scipy's matrices and its splu."""
 
+import threading
+import time
 import tracemalloc
 from itertools import pairwise
 
@@ -360,6 +362,25 @@ def test_workers_run_jobs_once_those_that_they_need_have_ended(threads):
     with pytest.raises(ValueError, match="job 12"):
         Workers(threads).run_after([job(k) for k in range(20)], needs)
     assert not {k for k in range(20) if 12 in needs[k]} & {*done}
+
+
+def test_a_failure_ends_threads_that_wait_for_what_will_not_come():
+    def fail():
+        time.sleep(0.05)  # the other thread waits by now
+        raise ValueError("job 0")
+
+    failures = []
+
+    def run():
+        try:
+            Workers(2).run_after([fail, fail], [[], [0]])
+        except ValueError as failure:
+            failures.append(str(failure))
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(60.0)  # else it would wait for ever
+    assert failures == ["job 0"]
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
