@@ -90,8 +90,9 @@ def test_a_lens_without_its_distortion_points_outward_at_the_rim_and_the_page_dr
     model, said = pycolmap.Reconstruction(scene), {}
     for bend in (0.15, 0.0):
         model.cameras[1].params = [500.0, 320.0, 240.0, bend]
-        check(model, second_opinion=False).report(tmp_path / "report.html")
-        (field,) = data_of((tmp_path / "report.html").read_text(encoding="utf-8"))["fields"]
+        page = tmp_path / f"{bend}.html"
+        check(model, second_opinion=False).report(page)
+        (field,) = data_of(page.read_text(encoding="utf-8"))["fields"]
         said[bend] = field["statement"]
         assert len(unpacked(field["places"])) == len(unpacked(field["means"])) > 20
     assert said[0.15] == NONE
