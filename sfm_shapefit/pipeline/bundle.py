@@ -69,14 +69,6 @@ def estimate_errors(model: ColmapModel) -> tuple[Images, Points, Estimate | None
     return images, points, replace(run, loss_scale_px=scale_px).estimate(problem)
 
 
-def structure_of(model: ColmapModel) -> Structure:
-    """Return the points of a model with its posed images."""
-    images = model.images
-    return Structure(
-        points_of(model.arrays, images), images, ModelKeypoints(images, points2d_of(model.arrays, images))
-    )
-
-
 def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:
     """Return the points that matches make where the cameras stand, but for those of contradicting pairs."""
     images, view = source.images, source.view

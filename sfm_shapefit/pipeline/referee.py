@@ -30,6 +30,7 @@ from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import contradicting
 from sfm_shapefit.files.colmap.model import ColmapModel
+from sfm_shapefit.files.colmap.points import structure_of
 from sfm_shapefit.judgement.check_reasons import CheckedModel, of_alike_pictures, reasons_against
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
@@ -43,7 +44,7 @@ from sfm_shapefit.judgement.reasons import (
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.pairs.direction_options import DirectionOptions
-from sfm_shapefit.pipeline.bundle import points_of_pictures, structure_of
+from sfm_shapefit.pipeline.bundle import points_of_pictures
 from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
@@ -100,7 +101,8 @@ def check_source(
 def read_structure(state: CheckState, clock: Clock) -> CheckState:
     """Read the points of a model, and how well they hold each image."""
     with clock("points"):
-        structure = structure_of(state.model)
+        images = state.images
+        structure = structure_of(state.model.arrays, images)
         quality = image_quality(*structure[:3])
         weak = tuple(find_weak_images(state.images, quality))
         return replace(state, structure=structure, quality=quality, weak=weak)
