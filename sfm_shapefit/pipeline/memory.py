@@ -47,10 +47,10 @@ _BLOCK = 9  # entries of a block of the factor; three coordinates by three
 _OBSERVATIONS_OF_A_MATCH = 0.7  # observations for a match, if keypoints are more; .45 to .66 measured
 _OBSERVATION_BYTES = 420.0  # bytes of an observation; its track, and its part of the normal equations
 _DIVIDED_BYTES = 270.0  # the same where adjustments are divided: a part has normal equations at a time
-_CHOSEN_BYTES, _KEPT_BYTES, _ENTRY_BYTES = 30.0, 70.0, 150.0
+_CHOSEN_BYTES, _KEPT_BYTES, _ENTRY_BYTES = 30.0, 75.0, 150.0
 """Bytes of an observation of few tracks: while these are chosen; laid out; and of its equations beside."""
 _OVERSHOT = 1.2  # observations of few tracks for each that an image wants; 1.13 measured
-_THIN_PAIRS, _THIN_FACTOR = 1.9, 1.8
+_THIN_PAIRS, _THIN_FACTOR = 1.9, 1.9
 """Pairs of cameras that meet in few tracks, for each of the graph; blocks of their factor, likewise."""
 _ITERATIVE_BYTES = 30e3  # bytes of a camera; the factors of its blocks in the preconditioner
 _AVERAGED_BLOCKS, _AVERAGED_FACTORS = 10.0, 1.2

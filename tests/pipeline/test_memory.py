@@ -217,8 +217,8 @@ def test_an_adjustment_on_few_tracks_takes_what_is_forecast():
     estimate_center_errors(adjust(problem, options).problem, options, 0.0)
     taken_mb = tracemalloc.get_traced_memory()[1] / 1e6
     tracemalloc.stop()
-    # The forecast has .95 of these pairs and .9 of this factor; in it, two copies of the factor and a fifth of
-    # one, where the inverse takes as much as the factor.
+    # The forecast has .95 of these pairs and of this factor, two copies of it and a fifth; the inverse takes
+    # as much as the factor, and what else there is next to nothing.
     assert 0.9 * taken_mb < full - empty < 1.3 * taken_mb
 
 
