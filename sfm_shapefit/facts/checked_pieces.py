@@ -8,6 +8,7 @@ from typing import Annotated, Self
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import distinct
 from sfm_shapefit.base.display import Displayed, NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
@@ -100,7 +101,7 @@ def _compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
     widths = np.concatenate([one.focal_widths for one in images.values()])
     model = np.repeat(np.arange(len(images)), [one.num_images for one in images.values()])
     for rows, _ in find_sequences(names):
-        members = np.unique(model[rows])
+        members = distinct(model[rows])
         typical = np.array([np.median(widths[rows][model[rows] == k]) for k in members])
         if np.ptp(np.log(typical)) > LOCAL_SHARE:
             least, most = (Path([*images][members[k]]).name for k in (typical.argmin(), typical.argmax()))

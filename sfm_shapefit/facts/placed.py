@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 
 from sfm_shapefit import __version__
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray, quantile
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.geometry import extent_of, fit_similarity_l1, median_spread
 from sfm_shapefit.base.record import Record
@@ -394,7 +394,7 @@ def pair_error_deg(placement: Judged) -> float | None:
 def residuals_deg(placement: Judged) -> dict[str, float]:
     """Return quantiles of the placed pairs' residuals in degrees, and the shares that lie beyond angles."""
     residuals = placement.assessment.residuals_deg[placement.pairs]
-    facts = {f"quantile_{q}": float(np.quantile(residuals, q / 100.0)) for q in _QUANTILES}
+    facts = {f"quantile_{q}": float(quantile(residuals, q / 100.0)) for q in _QUANTILES}
     return facts | {f"share_beyond_{angle}": float(np.mean(residuals > angle)) for angle in _ANGLES_DEG}
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, stable_order
 from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.judgement.evidence import OddImages
@@ -77,7 +77,7 @@ def _find_duplicates(
 def _places(images: Images, pictures: KeypointRays, batch: KeypointMatches, side: int) -> FloatArray:
     """Return where the matches of pairs are in their first or second image, (M, 2), in its widths."""
     image_of = batch.spread(batch.pairs[:, side])
-    order, (present, counts) = np.argsort(image_of, kind="stable"), np.unique(image_of, return_counts=True)
+    order, (present, counts) = stable_order(image_of), np.unique(image_of, return_counts=True)
     places = np.empty((len(image_of), 2))
     for image, rows in zip(present.tolist(), np.split(order, np.cumsum(counts)[:-1]), strict=True):
         width = max(images.lenses[images.lens_of[image]].width, 1)

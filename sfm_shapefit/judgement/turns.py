@@ -43,7 +43,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, quantile, rows_taken
 from sfm_shapefit.base.geometry import nearest_rotations, rotation_angles_deg
 from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
@@ -268,7 +268,7 @@ class _Verdicts:
 
 def _pairs_of(members: IntArray, touching: RowLists) -> IntArray:
     """Return the pairs that some groups have a part in, ascending; `touching` has the ends of each group."""
-    return np.unique(touching.subset(members).rows // 2)
+    return distinct(touching.subset(members).rows // 2)
 
 
 def _angles(rotations: FloatArray) -> FloatArray:
@@ -281,8 +281,8 @@ def _level(pairs: PairTurns) -> float:
     known = np.isfinite(pairs.sigmas_rad)
     if not known.any():
         return 1.0
-    quantile = float(np.quantile(_angles(pairs.turns[known]) / pairs.sigmas_rad[known], _LEVEL_QUANTILE))
-    return quantile / _NORMAL_QUANTILE
+    ratios = _angles(pairs.turns[known]) / pairs.sigmas_rad[known]
+    return float(quantile(ratios, _LEVEL_QUANTILE)) / _NORMAL_QUANTILE
 
 
 def _contradicts(pairs: PairTurns) -> BoolArray:

@@ -35,7 +35,7 @@ from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.placement.gauge_rule import between_images
 from sfm_shapefit.placement.memory_plan import MEMORY_PLANS, MemoryPlan
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
-from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
+from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.averaging_options import AveragingOptions
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
@@ -284,6 +284,8 @@ class ComponentAveraging(NamedTuple):
             answer = replace(chosen.averaged, num_repeated=repeated, num_rivals=rivals)
         if self.gravity is None:
             return answer
+        from sfm_shapefit.rotations.gravity import refine_with_gravity  # it loads long
+
         return refine_with_gravity(answer, local, self.gravity.of(members))
 
 
@@ -304,15 +306,3 @@ def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:
     """Return the connected components, ascending, the largest first; single frames are components too."""
     groups = RowLists.by_label(connected_components(num_frames, pairs))
     return sorted(groups, key=lambda group: (-len(group), int(group[0])))
-
-
-def refine_with_gravity(
-    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
-) -> AveragedRotations:
-    """Return averaged rotations of frames refined on their pairs and gravities together."""
-    from sfm_shapefit.rotations.gravity import with_gravity  # it loads long
-
-    supports = relative.weight_shares * relative.num_matches
-    count = len(averaged.registered)
-    given = check_pairs(relative.pairs, relative.rotations, relative.information, supports, count)
-    return with_gravity(averaged, given, gravity)

@@ -8,7 +8,7 @@ import numpy as np
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import Advance, Crew
 from sfm_shapefit.base.geometry import Similarity
@@ -177,14 +177,14 @@ class ModelState:
     def freedom_of(self, rows: IntArray) -> Freedom:
         """Return the freedom of the frames and lenses of some images (r,)."""
         images = self.source.images
-        return self.freedom.of(np.unique(images.frame_of[rows]), np.unique(images.lens_of[rows]))
+        return self.freedom.of(distinct(images.frame_of[rows]), distinct(images.lens_of[rows]))
 
     def given_poses(self, rows: IntArray) -> GivenPoses:
         """Return what is known of the frames of some images (r,) beside the pixels."""
         images = self.inputs.images
         rotations = None if self.adjustment is None else images.frames.rotations
         given = GivenPoses(rotations, self.inputs.fixed_frames, self.held)
-        return given.of(np.unique(images.frame_of[rows]))
+        return given.of(distinct(images.frame_of[rows]))
 
     def crew_of(self, clock: Clock) -> Crew:
         """Return who works, and how for memory."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
@@ -283,7 +283,7 @@ def count_large(pieces: list[RigidPiece], measured: MeasuredGraph) -> int:
 
 def _count_moving(nodes: IntArray, measured: MeasuredGraph) -> int:
     """Return the number of cameras among some nodes, or of the groups that these are in."""
-    return len(np.unique(measured.moving[nodes[nodes < measured.num_cameras]]))
+    return len(distinct(measured.moving[nodes[nodes < measured.num_cameras]]))
 
 
 def refuse_without_triangle(measured: MeasuredGraph, pieces: list[RigidPiece]) -> None:
@@ -317,7 +317,7 @@ def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
         )
     inside = np.isin(groups.group_of[edges], tied).all(axis=1)
     rows = np.flatnonzero(inside & groups.joins(edges))
-    return RigidPiece(nodes=np.unique(edges[rows]), edges=rows, hinges=np.zeros(0, dtype=np.int64))
+    return RigidPiece(nodes=distinct(edges[rows]), edges=rows, hinges=np.zeros(0, dtype=np.int64))
 
 
 def measure_unit(part: MeasuredGraph, locations: FloatArray) -> tuple[float, float]:

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, quantile
 from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread, tangent_bases
@@ -299,7 +299,7 @@ def _within_reach(t: FloatArray) -> FloatArray:
 
 def _motion(t: FloatArray, moved: FloatArray) -> float:
     """Return the most that nine tenths of the nodes moved, over the extent; loose ones wander for long."""
-    return float(np.quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
+    return float(quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
 
 
 def _residuals(graph: ViewGraph, t: FloatArray) -> FloatArray:

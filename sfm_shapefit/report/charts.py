@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, quantile
 from sfm_shapefit.report.drawing import PairClass, Pairs
 
 _RANGE_DEG = (1e-3, 180.0)  # degrees from the first bin to the last; smaller residuals count in the first
@@ -55,7 +55,7 @@ def reprojection_error_bars(errors_px: FloatArray) -> dict[str, Any] | None:
     known = errors_px[np.isfinite(errors_px)]
     if not len(known):
         return None
-    largest = max(float(np.quantile(known, _ERROR_QUANTILE)), 1e-6)
+    largest = max(float(quantile(known, _ERROR_QUANTILE)), 1e-6)
     power = 10.0 ** math.floor(math.log10(largest / _ERROR_BARS))
     width = next(part * power for part in (1, 2, 2.5, 5, 10) if part * power * _ERROR_BARS >= largest)
     bars = max(math.ceil(largest / width - 1e-9), 1)

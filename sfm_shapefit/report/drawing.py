@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, quantile
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.facts.rows import covariances_of
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
@@ -354,7 +354,7 @@ def _points(picked: PickedPoints | None, cameras: FloatArray) -> PickedPoints:
         return PickedPoints(nothing, nothing.astype(np.uint8), np.zeros(0, np.int64), np.zeros(0), 0)
     both = np.concatenate([picked.xyz, cameras])
     middle = np.median(both, axis=0)
-    limit = _FAR_POINT * np.quantile(np.linalg.norm(both - middle, axis=1), 0.9)
+    limit = _FAR_POINT * quantile(np.linalg.norm(both - middle, axis=1), 0.9)
     near = np.linalg.norm(picked.xyz - middle, axis=1) <= limit
     errors_px = np.where(picked.errors_px >= 0.0, picked.errors_px, np.nan)
     return picked._replace(xyz=picked.xyz[near], colors=picked.colors[near], errors_px=errors_px)
@@ -364,7 +364,7 @@ def _frustum_depth(positions: FloatArray) -> float:
     """Return how deep frusta are drawn: well below the distance between neighbors."""
     if len(positions) < 2:
         return 1.0
-    low, high = np.quantile(positions, [0.05, 0.95], axis=0)
+    low, high = quantile(positions, 0.05), quantile(positions, 0.95)
     extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
     some = positions[:: max(len(positions) // _MEASURED, 1)]
     apart = [np.partition(np.linalg.norm(positions - own, axis=1), 1)[1] for own in some]

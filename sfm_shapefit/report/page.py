@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, quantile
 from sfm_shapefit.base.record import plain
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.command_options import LocateOptions, MapOptions
@@ -403,7 +403,7 @@ def _reprojection_note(points: PickedPoints) -> str:
     known = points.errors_px[np.isfinite(points.errors_px)]
     if not len(known):
         return ""
-    median, high = np.quantile(known, [0.5, 0.9])
+    median, high = quantile(known, 0.5), quantile(known, 0.9)
     return (
         f"Mean error of a 3D point over the images that see it: {median:.2g} px in the median, "
         f"{high:.2g} px or less for nine of ten.{_sample(points)}"

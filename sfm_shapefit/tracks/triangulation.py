@@ -163,7 +163,7 @@ def triangulate_matches(
         is_left = np.ones(len(rows), dtype=np.bool_)
         is_left[seen.rows] = False
     tracks = _concatenate([seen for _, seen in parts])
-    return matched.observed(tracks), TriangulatedPoints(
+    return matched.observed(tracks, threads), TriangulatedPoints(
         points=np.concatenate([points for points, _ in parts]),
         tracks=np.arange(len(tracks.offsets) - 1),
         points_seen=tracks.spread(np.arange(len(tracks.offsets) - 1, dtype=np.int32)),
@@ -187,7 +187,7 @@ def _triangulate_joined(
     points, seen = list[FloatArray](), list[RowLists]()
     for tracks in pairwise([0, *cuts, len(joined.offsets) - 1]):
         own = joined.subset(np.arange(*tracks))
-        found = triangulate_tracks(matched.observed(own), poses, limits, threads)
+        found = triangulate_tracks(matched.observed(own, threads), poses, limits, threads)
         points.append(found.points)
         seen.append(own.of(RowLists.by_label(found.points_seen, len(found.points))))
     return np.concatenate(points), _concatenate(seen)
