@@ -55,7 +55,6 @@ class _Share(NamedTuple):
     nodes: IntArray
 
     def of(self, values: Values) -> Values:
-        """Return the values that the part is about."""
         return Values(
             rotations=values.rotations[self.frames],
             centers=values.centers[self.frames],

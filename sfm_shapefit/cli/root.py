@@ -85,7 +85,6 @@ class _ByImportance(TyperGroup):
         return known + [name for name in super().list_commands(ctx) if name not in known]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a section for each group."""
         known = self.list_commands(ctx)
         for title, names in _GROUPS.items():
             shown = [(name, self.commands[name].get_short_help_str(100)) for name in names if name in known]

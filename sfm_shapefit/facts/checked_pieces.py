@@ -85,7 +85,6 @@ class CheckedPieces(Record, Displayed, repr=False):
 
 
 def _choose_kept(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -> Iterator[str]:
-    """Yield the folders of the models to keep."""
     usable = [p for p in pieces if p.facts and p.facts.verdict.grade in (Grade.GOOD, Grade.LOOK)]
     taken = set[str]()
     for one in sorted(usable, key=lambda one: -images[one.folder].num_images):
@@ -113,7 +112,6 @@ def _compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
 
 
 def _shared_images(images: Mapping[str, Images]) -> Iterator[str]:
-    """Yield which models have images in common."""
     for (one, mine), (other, others) in combinations(images.items(), 2):
         if common := len(set(mine.names) & set(others.names)):
             both = f"{Path(one).name} and {Path(other).name} have {counted(common, 'image')} in common"

@@ -231,7 +231,6 @@ class _Judged(NamedTuple):
 
     @property
     def kind(self) -> Doubt:
-        """The verdict."""
         share = self.placed / max(self.placed + self.turned, 1e-300)
         if share < RIVAL_SHARE * RIGHT_SHARE and self.num_turned > 1:
             return Doubt.TURNED
@@ -248,7 +247,6 @@ class _Verdicts:
         self.body_of: IntArray = np.arange(count)
 
     def note(self, members: IntArray, found: _Judged) -> None:
-        """Note what is said of the groups of a body."""
         for member in members.tolist():
             self.judged[member] = found
         self.body_of[members] = members[0]

@@ -216,7 +216,6 @@ def plan_factorization(graph: Adjacency, edges: IntArray, tree: EliminationTree)
 
 
 def _inverse(permutation: IntArray) -> IntArray:
-    """Return the inverse of a permutation."""
     inverse = np.empty_like(permutation)
     inverse[permutation] = np.arange(len(permutation))
     return inverse

@@ -88,7 +88,6 @@ class _Image(NamedTuple):
 
     @classmethod
     def of(cls, pixels: FloatArray, size: FloatArray, partners: IntArray) -> "_Image":
-        """Return the keypoints of an image that are matched."""
         matched = partners > 0
         return cls(np.ascontiguousarray(pixels[matched].T), partners[matched], np.cumsum(matched) - 1, size)
 

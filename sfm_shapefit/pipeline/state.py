@@ -27,7 +27,8 @@ from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
 from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged, find_fixed_and_rigged
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.gauge_rule import GaugeRule
-from sfm_shapefit.placement.place import InitialPlacement, Placement
+from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.matches import is_among
@@ -48,8 +49,8 @@ class ModelState:
     rigid: FixedAndRigged
     intrinsics: RefinedIntrinsics
     """What may still change of lenses in doubt, and what became of them so far."""
-    near: InitialPlacement | None = None
-    """Where the adjustment of a first placement has the images."""
+    near: RefinedPlacement | None = None
+    """A first placement, at the centers (i, 3) where its adjustment has the images, NaN for others."""
     first: Estimate | None = None
     """How a first placement was adjusted."""
     measured: MeasuredPairs = _LATER

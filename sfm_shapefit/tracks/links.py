@@ -18,7 +18,8 @@ from sfm_shapefit.base.executors import gathered, in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
-from sfm_shapefit.tracks.joining import number_trees, sampson_px, write_ray
+from sfm_shapefit.scene.epipolar import sampson_px, write_ray
+from sfm_shapefit.tracks.joining import number_trees
 
 # Between two slices Python can be interrupted: about 200 ms. For each all keypoints are counted.
 _MATCHES_A_SLICE = 4_000_000
@@ -164,7 +165,6 @@ def _join(matches: npt.NDArray[np.integer], given: Any, parents: Int32Array, thr
 
 @kernel
 def _merge(matches: Any, chosen: Any, parents: Any) -> None:
-    """Join the keypoints of the chosen matches."""
     for m in range(len(matches)):
         if chosen[m]:
             merge_sets(parents, matches[m, 0], matches[m, 1])

@@ -30,8 +30,9 @@ from sfm_shapefit.base.lists import Lists, offsets_of
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
+from sfm_shapefit.scene.epipolar import sampson_px
 from sfm_shapefit.scene.matches import MatchBatch
-from sfm_shapefit.tracks.joining import number_trees, sampson_px
+from sfm_shapefit.tracks.joining import number_trees
 
 # Observations per camera; about 3 tracks started per camera, of 6 views each, determine a straight road.
 _PER_CAMERA = 20

@@ -26,7 +26,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.lists import RowLists, offsets_of
-from sfm_shapefit.tracks.joining import write_ray
+from sfm_shapefit.scene.epipolar import write_ray
 from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTracks
 
 # Observations between which Python can be interrupted: about 0.1 s.
@@ -194,7 +194,6 @@ def _triangulate_joined(
 
 
 def _concatenate(parts: Sequence[RowLists]) -> RowLists:
-    """Return the lists of all parts."""
     lengths = np.concatenate([part.lengths() for part in parts])
     return RowLists(offsets_of(lengths), np.concatenate([part.rows for part in parts]))
 
