@@ -32,7 +32,7 @@ from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import contradicting
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
+from sfm_shapefit.files.colmap.points import ModelKeypoints, structure_of
 from sfm_shapefit.judgement.check_reasons import CheckedModel, of_alike_pictures, reasons_against
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
@@ -121,9 +121,8 @@ def check_source(
 def read_structure(state: CheckState, clock: Clock) -> CheckState:
     """Read the points of a model, and how well they hold each image."""
     with clock("points"):
-        arrays, images = state.model.arrays, state.images
-        pictures = ModelKeypoints(images, points2d_of(arrays, images))
-        structure = Structure(points_of(arrays, images), images, pictures)
+        images = state.images
+        structure = structure_of(state.model.arrays, images)
         quality = image_quality(*structure[:3])
         weak = tuple(find_weak_images(images, quality))
         return replace(state, structure=structure, quality=quality, weak=weak)
