@@ -146,6 +146,16 @@ def test_begin_takes_rotations_as_they_are_or_makes_averaged_and_rough_ones_fine
     assert np.abs(placed - TRUTH.centers).max() < 1e-6 * np.ptp(TRUTH.centers)
 
 
+def test_a_state_says_who_is_fixed_and_whose_matches_are_read():
+    with opened() as source:
+        state, fixed = state_at(source, 0.1 * TRUTH.centers), np.arange(8) < 2
+        held = ModelState.of(replace(state.inputs, fixed=fixed), source)
+    assert (state.source.fixed, state.among) == (None, None)
+    np.testing.assert_array_equal(held.source.fixed, fixed)
+    second = replace(state.placement, pieces=2 * state.placement.pieces, piece=1)
+    np.testing.assert_array_equal(replace(state, placement=second).among, np.arange(8))
+
+
 def test_measured_directions_are_those_of_the_true_cameras():
     with opened() as source:
         state = measure_directions(state_at(source, TRUTH.centers), Clock())
