@@ -61,6 +61,7 @@ from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.sequences import Loop
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.solver.solver_options import SolverResult
 
 if TYPE_CHECKING:
@@ -83,6 +84,10 @@ class ModelInArrays(Protocol):
     @property
     def as_it_is(self) -> Any:
         """The reconstruction, which may have been changed, if it is made; else the model itself."""
+
+    @property
+    def structure(self) -> Structure:
+        """The points, and what they are seen with."""
 
     def colored(self, pictures: Any) -> tuple["ModelInArrays", tuple[str, ...]]:
         """Return the model with colors of pictures, and the names of those that cannot be read."""

@@ -35,9 +35,8 @@ def stay_near(
     is_lost = fit.scale * median_spread(centers) <= _COLLAPSED * size
     locations[: len(centers)] = centers if is_lost else fit.apply(centers)
     locations = normalize_locations(graph, follow_cameras(measured, locations))
-    levels = np.full(int(measured.classes.max()) + 1, OPENING_RAD)
-    for _ in range(_ROUNDS):
-        levels = residual_levels(measured, locations, levels)
+    opening = np.full(int(measured.classes.max()) + 1, OPENING_RAD)
+    levels = residual_levels(measured, locations, opening, _ROUNDS)
     moved = near.moved_to(
         locations,
         np.empty(0, dtype=np.int64),

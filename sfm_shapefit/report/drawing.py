@@ -16,9 +16,10 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, quantile
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.facts.rows import covariances_of
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting, rejected
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.report.lens_residuals import LensField
 from sfm_shapefit.scene.images import Images
 
 MAX_PAIRS = 20_000
@@ -43,6 +44,7 @@ class PairClass(enum.IntEnum):
     CONTRADICTS = 1
     UNDETERMINED = 2
     NO_DIRECTION = 3
+    REJECTED = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,7 +152,7 @@ class Pairs:
 
     def worst_first(self) -> IntArray:
         """Return the rows, those that contradict the solution most first, those without a direction last."""
-        rank = np.array([2, 0, 1, 3])[self.classes]
+        rank = np.array([2, 0, 1, 4, 3])[self.classes]
         return np.asarray(np.lexsort((-self.support, -np.nan_to_num(self.residuals_deg), rank)))
 
 
@@ -176,6 +178,8 @@ class Drawing:
     """Further figures of the cameras."""
     lenses: tuple[LensRow, ...] = ()
     """All lenses of the model."""
+    fields: tuple[LensField, ...] = ()
+    """Mean residuals over the pictures of those with most images."""
 
     def shifts(self) -> FloatArray:
         """(n,) how far cameras stand from where the input has them; NaN where the two cannot be compared."""
@@ -315,8 +319,9 @@ def _pairs(rows: Table[PairRow], cameras: Cameras, certified: FloatArray | None)
     ends = np.array([[row_of[name] for name in columns[end]] for end in ("name1", "name2")], dtype=np.int64).T
     directions, undetermined = columns["direction"], columns["verdict"] == Verdict.UNDETERMINED.value
     is_known = np.isfinite(directions).all(axis=1)
-    kinds = PairClass.NO_DIRECTION, PairClass.UNDETERMINED, PairClass.CONTRADICTS
-    classes = np.select([~is_known, undetermined, contradicting(rows)], kinds, PairClass.AGREES)
+    kinds = PairClass.REJECTED, PairClass.NO_DIRECTION, PairClass.UNDETERMINED, PairClass.CONTRADICTS
+    of_kind = [~is_known & rejected(rows), ~is_known, undetermined, contradicting(rows)]
+    classes = np.select(of_kind, kinds, PairClass.AGREES)
     return Pairs(
         cameras=ends,
         classes=classes.astype(np.int64),

@@ -7,14 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_shapefit.facts.check_result import CheckResult
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Table
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
+from sfm_shapefit.files.colmap.points import structure_of
 from sfm_shapefit.files.colmap.seed import pick_points
 from sfm_shapefit.judgement.image_quality import ImageQuality
 from sfm_shapefit.report.drawing import MAX_POINTS, CameraColumn, Drawing, LensRow, build_drawing, poses_of
+from sfm_shapefit.report.lens_residuals import lens_fields
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 
@@ -40,6 +43,7 @@ def draw_result(found: LocateResult | GraphResult) -> Drawing:
         input_is_aligned=isinstance(found, LocateResult) and found.gauge.scale == "input",
         history=tuple((info.iteration, info.objective, info.dual_bound) for info in placement.history),
         lenses=_lenses(found.images) if isinstance(found, LocateResult) else (),
+        fields=lens_fields(found.seed.structure) if isinstance(found, LocateResult) else (),
     )
 
 
@@ -48,13 +52,11 @@ def draw_joined(found: JoinedModel) -> Drawing:
     return _draw_as_it_stands(read_model(found.reconstruction), found.cameras, found.pairs)
 
 
-def draw_checked(
-    model: ColmapModel, cameras: Table[CameraRow], pairs: Table[PairRow], quality: ImageQuality
-) -> Drawing:
+def draw_checked(found: CheckResult) -> Drawing:
     """Return the drawing of a model that was judged, with how well points hold each of its images."""
-    drawing = _draw_as_it_stands(model, cameras, pairs)
+    quality, drawing = found.quality, _draw_as_it_stands(found.model, found.cameras, found.pairs)
     points = drawing.points._replace(errors_px=quality.point_errors_px, lengths=quality.point_track_lengths)
-    return replace(drawing, further=tuple(_columns(quality, len(cameras))), points=points)
+    return replace(drawing, further=tuple(_columns(quality, len(found.cameras))), points=points)
 
 
 def draw_model(model: ColmapModel, trust: Mapping[str, float]) -> Drawing:
@@ -73,7 +75,11 @@ def _draw_as_it_stands(model: ColmapModel, cameras: Table[CameraRow], pairs: Tab
     poses = poses_of(model.images, list(cameras.columns["name"]))
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
     points = pick_points(model.arrays, MAX_POINTS)
-    return replace(build_drawing(cameras, pairs, poses=poses, points=points), lenses=_lenses(model.images))
+    return replace(
+        build_drawing(cameras, pairs, poses=poses, points=points),
+        lenses=_lenses(model.images),
+        fields=lens_fields(structure_of(model.arrays, model.images)),
+    )
 
 
 def _lenses(images: Images) -> tuple[LensRow, ...]:
@@ -91,7 +97,7 @@ def _lens_row(lens: Lens, num_images: int) -> LensRow:
         f"{lens.width} x {lens.height}",
         ", ".join(f"{value:,.1f}" for value in focal),
         ", ".join(f"{value:,.1f}" for value in point),
-        ", ".join(f"{value:.4g}" for value in distortion),
+        ", ".join(f"{value:.4g}" for value in distortion) or "none",
     )
 
 

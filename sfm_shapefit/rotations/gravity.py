@@ -84,18 +84,24 @@ def _level(off: FloatArray) -> float:
     return float(np.median(off[near])) / _MEDIAN_LENGTH if near.any() else 0.0
 
 
-def with_gravity(averaged: AveragedRotations, given: AveragingPairs, gravity: Gravity) -> AveragedRotations:
+def refine_with_gravity(
+    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
+) -> AveragedRotations:
     """Return averaged rotations refined on pairs and gravities together, in a world whose z points up.
 
     Args:
         averaged: rotations of n images, by the pairs alone.
-        given: the pairs, among these images.
+        relative: the pairs, among these images.
         gravity: gravities of images that have a rotation; with fewer than two `averaged` is returned.
     """
     members = np.flatnonzero(averaged.registered).astype(np.int64)
     gravities = gravity.of(members)
     if len(gravities.indices) < FEWEST_GRAVITIES:
         return averaged
+    supports = relative.weight_shares * relative.num_matches
+    given = check_pairs(
+        relative.pairs, relative.rotations, relative.information, supports, len(averaged.registered)
+    )
     upright = averaged.rotations @ turn_upright(down_of(averaged.rotations[members], gravities)).T
     inside: BoolArray = np.asarray(averaged.registered[given.pairs].all(axis=1))
     inner = given.subset(inside)
@@ -138,13 +144,13 @@ def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Re
     turns = np.concatenate([turns, [[0.0, 0.0, 0.0, 1.0]]])
     system = plan_system(graph.num_cameras, graph.pairs, np.sqrt(graph.supports), 1)
     k, m = len(graph.pairs), len(gravity.indices)
-    distances, blocks, gradient = np.empty(k), np.empty((k, 3, 3)), np.empty((graph.num_cameras, 3))
+    distances, blocks, pulls = np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3))
 
     def weigh(scale: float) -> float:
         graph.measured[k - m :] = _follow(turns, gravity)
-        weigh_blocks(
-            graph.pairs, graph.measured, turns, graph.information, float(_LIMIT), scale, distances, blocks,
-            gradient,
+        system.over_pairs(
+            weigh_blocks, graph.pairs, graph.measured, turns, graph.information, float(_LIMIT), scale,
+            distances, blocks, pulls,
         )  # fmt: skip
         inside = distances[: k - m][~np.isnan(distances[: k - m])]
         median = float(np.median(inside)) if len(inside) else 1.0
@@ -152,7 +158,8 @@ def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Re
 
     scale = weigh(weigh(SCALE_OF_MEDIAN))
     for _ in range(_ROUNDS):
-        turned = turn_cameras(turns, system.solve_blocks(blocks, gradient, LAST_REDUCTION), LONGEST_STEP)
+        steps = system.solve_blocks(blocks, system.gradient_of(pulls), LAST_REDUCTION)
+        turned = turn_cameras(turns, steps, LONGEST_STEP)
         scale = weigh(scale)
         if turned <= SETTLED:
             break
@@ -168,8 +175,8 @@ def _join_world(given: AveragingPairs, turns: FloatArray, gravity: Gravity) -> A
     n, k, m = given.num_cameras, len(given.pairs), len(gravity.indices)
     distances, limit = np.empty(k), float(np.radians(AGREEMENT_DEG))
     weigh_blocks(
-        given.pairs, given.measured, turns, given.information, limit, 1.0, distances, np.empty((k, 3, 3)),
-        np.empty((n, 3)),
+        0, k, given.pairs, given.measured, turns, given.information, limit, 1.0, distances,
+        np.empty((k, 3, 3)), np.empty((k, 3)),
     )  # fmt: skip
     agreeing = given.subset(~np.isnan(distances))
     # On average, of a connected graph.
@@ -202,13 +209,3 @@ def _shortest_turns(sources: FloatArray, target: FloatArray) -> Rotation:
     axes[opposite] = np.cross(target, np.eye(3)[int(np.argmin(np.abs(target)))])
     angles = angle_between(sources, np.broadcast_to(target, sources.shape))
     return Rotation.from_rotvec(angles[:, None] * normalized(axes))
-
-
-def refine_with_gravity(
-    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
-) -> AveragedRotations:
-    """Return averaged rotations of frames refined on their pairs and gravities together."""
-    supports = relative.weight_shares * relative.num_matches
-    count = len(averaged.registered)
-    given = check_pairs(relative.pairs, relative.rotations, relative.information, supports, count)
-    return with_gravity(averaged, given, gravity)
