@@ -7,16 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit import (
-    evaluate,
-    inspect,
-    join,
-    locate,
-    map_database,
-    place,
-    relative_rotations,
-    synthetic,
-)
+from sfm_shapefit import evaluate, inspect, join, locate, map_database, place, relative_rotations, synthetic
 from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.covariance import estimate_covariances

@@ -17,11 +17,7 @@ from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
-from sfm_shapefit.facts.joined_cameras import (
-    JoinedGroup,
-    JoinInputs,
-    tell_joined,
-)
+from sfm_shapefit.facts.joined_cameras import JoinedGroup, JoinInputs, tell_joined
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.scale_bars import compare_bars

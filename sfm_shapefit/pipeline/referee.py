@@ -35,12 +35,7 @@ from sfm_shapefit.judgement.check_reasons import CheckedModel, of_alike_pictures
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
-from sfm_shapefit.judgement.reasons import (
-    Kind,
-    ModelVerdict,
-    Reason,
-    of_model,
-)
+from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_model
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.pairs.direction_options import DirectionOptions
