@@ -157,6 +157,10 @@ def test_a_state_says_who_is_fixed_and_whose_matches_are_read():
     assert state.given_poses(np.arange(8)).rotations is None
     adjusted = replace(state, adjustment=SimpleNamespace()).given_poses(np.arange(2, 5))
     np.testing.assert_array_equal(adjusted.rotations, state.inputs.images.rotations[2:5])
+    first, last = SimpleNamespace(), SimpleNamespace()
+    assert replace(state, first=first).estimate is first
+    assert replace(state, first=first, adjustment=last).estimate is last
+    assert replace(state, first=first, adjustment=first, bundle=last).estimate is last
 
 
 def test_measured_directions_are_those_of_the_true_cameras():
