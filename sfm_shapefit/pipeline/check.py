@@ -3,6 +3,7 @@
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import MapResult
+from sfm_shapefit.facts.tables import told_of
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself, read_source
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
@@ -75,7 +77,16 @@ def check(
                 if not inputs.is_found:
                     raise
                 file.notes.append(f"there is no second opinion: {error}")
-        return check_source(posed, source, DirectionOptions(), clock, other)
+        found = check_source(posed, source, DirectionOptions(), clock, other)
+    return replace(found, facts=replace(found.facts, options=_made_with(model)))
+
+
+def _made_with(model: ModelSource) -> dict[str, Any]:
+    """Return the options with which `locate` or `map` made a model; none of another one."""
+    try:
+        return told_of(model, "options", dict) or {}
+    except InputError:  # another program's locate.json, or a damaged one
+        return {}
 
 
 def _map_anew(
