@@ -22,10 +22,10 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 from sfm_shapefit.base.kernel_cache import PACKAGE, RUNTIME, stamp_of, write_whole
-from sfm_shapefit.pipeline.warm_up import FURTHER, NEEDED
+from sfm_shapefit.commands.warm_up import FURTHER, NEEDED
 
 ROOT = Path(__file__).parents[1]
-_NOTES = Path("pipeline")
+_NOTES = Path("commands")
 """Where warm-up notes the examples that are done; it has no kernels."""
 
 

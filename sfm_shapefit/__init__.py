@@ -31,6 +31,22 @@ if TYPE_CHECKING:
     from sfm_shapefit.base.errors import ShapeFitError as ShapeFitError
     from sfm_shapefit.base.errors import UnsolvableError as UnsolvableError
     from sfm_shapefit.base.executors import WorkerError as WorkerError
+    from sfm_shapefit.commands.check import check as check
+    from sfm_shapefit.commands.check import check_pieces as check_pieces
+    from sfm_shapefit.commands.convert import convert as convert
+    from sfm_shapefit.commands.drop_in import average_database as average_database
+    from sfm_shapefit.commands.drop_in import global_mapping as global_mapping
+    from sfm_shapefit.commands.evaluate import evaluate as evaluate
+    from sfm_shapefit.commands.inspect import inspect as inspect
+    from sfm_shapefit.commands.join import join as join
+    from sfm_shapefit.commands.locate import locate as locate
+    from sfm_shapefit.commands.map import map_database as map_database
+    from sfm_shapefit.commands.match import match_images as match_images
+    from sfm_shapefit.commands.place import place as place
+    from sfm_shapefit.commands.workspace import Workspace as Workspace
+    from sfm_shapefit.commands.workspace import workspace as workspace
+    from sfm_shapefit.commands.write import WriteOptions as WriteOptions
+    from sfm_shapefit.commands.write import write_result as write_result
     from sfm_shapefit.facts.command_options import InspectOptions as InspectOptions
     from sfm_shapefit.facts.command_options import JoinOptions as JoinOptions
     from sfm_shapefit.facts.command_options import LocateOptions as LocateOptions
@@ -47,25 +63,9 @@ if TYPE_CHECKING:
     from sfm_shapefit.pairs.direction_options import DirectionOptions as DirectionOptions
     from sfm_shapefit.pipeline.bundle_adjust import AdjustedModel as AdjustedModel
     from sfm_shapefit.pipeline.bundle_adjust import bundle_adjust as bundle_adjust
-    from sfm_shapefit.pipeline.check import check as check
-    from sfm_shapefit.pipeline.check import check_pieces as check_pieces
-    from sfm_shapefit.pipeline.convert import convert as convert
-    from sfm_shapefit.pipeline.drop_in import average_database as average_database
-    from sfm_shapefit.pipeline.drop_in import global_mapping as global_mapping
-    from sfm_shapefit.pipeline.evaluate import evaluate as evaluate
-    from sfm_shapefit.pipeline.inspect import inspect as inspect
-    from sfm_shapefit.pipeline.join import join as join
     from sfm_shapefit.pipeline.lengths import evaluate_lengths as evaluate_lengths
-    from sfm_shapefit.pipeline.locate import locate as locate
-    from sfm_shapefit.pipeline.map import map_database as map_database
-    from sfm_shapefit.pipeline.match import match_images as match_images
-    from sfm_shapefit.pipeline.place import place as place
     from sfm_shapefit.pipeline.referee import CheckResult as CheckResult
     from sfm_shapefit.pipeline.relative_rotations import relative_rotations as relative_rotations
-    from sfm_shapefit.pipeline.workspace import Workspace as Workspace
-    from sfm_shapefit.pipeline.workspace import workspace as workspace
-    from sfm_shapefit.pipeline.write import WriteOptions as WriteOptions
-    from sfm_shapefit.pipeline.write import write_result as write_result
     from sfm_shapefit.placement.gauge_options import GaugeOptions as GaugeOptions
     from sfm_shapefit.placement.place import Placement as Placement
     from sfm_shapefit.refinement.placement_options import PlacementOptions as PlacementOptions
@@ -88,20 +88,20 @@ _HOMES = {
     "files.undistortion_options": ("UndistortionOptions",),
     "adjustment.adjustment_options": ("AdjustmentOptions",),
     "pipeline.bundle_adjust": ("AdjustedModel", "bundle_adjust"),
-    "pipeline.check": ("check", "check_pieces"),
+    "commands.check": ("check", "check_pieces"),
     "pipeline.referee": ("CheckResult",),
-    "pipeline.convert": ("convert",),
-    "pipeline.drop_in": ("average_database", "global_mapping"),
-    "pipeline.evaluate": ("evaluate",),
-    "pipeline.inspect": ("inspect",),
-    "pipeline.join": ("join",),
+    "commands.convert": ("convert",),
+    "commands.drop_in": ("average_database", "global_mapping"),
+    "commands.evaluate": ("evaluate",),
+    "commands.inspect": ("inspect",),
+    "commands.join": ("join",),
     "pipeline.lengths": ("evaluate_lengths",),
-    "pipeline.locate": ("locate",),
-    "pipeline.map": ("map_database",),
-    "pipeline.match": ("match_images",),
+    "commands.locate": ("locate",),
+    "commands.map": ("map_database",),
+    "commands.match": ("match_images",),
     "pipeline.relative_rotations": ("relative_rotations",),
-    "pipeline.workspace": ("Workspace", "workspace"),
-    "pipeline.write": ("WriteOptions", "write_result"),
+    "commands.workspace": ("Workspace", "workspace"),
+    "commands.write": ("WriteOptions", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "base.executors": ("WorkerError",),
     "facts.command_options": (
@@ -117,7 +117,7 @@ _HOMES = {
     "rotations.averaging_options": ("AveragingOptions",),
     "scene.freedom": ("FreedomOptions",),
     "tracks.structure_options": ("NodeOptions", "StructureOptions"),
-    "pipeline.place": ("place",),
+    "commands.place": ("place",),
     "placement.place": ("Placement",),
     "refinement.placement_options": ("PlacementOptions",),
     "facts.map_result": ("JoinedModel", "MapResult"),
@@ -137,7 +137,7 @@ __all__ = list(_HOME_OF)
 
 def _load_writers() -> _Any:
     """Return what writes results, for `base.display`, which stands below it."""
-    return _import_module(f"{__name__}.pipeline.write").WRITERS
+    return _import_module(f"{__name__}.commands.write").WRITERS
 
 
 def __getattr__(name: str) -> _Any:

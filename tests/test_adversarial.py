@@ -9,10 +9,10 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit import TrustOptions
 from sfm_shapefit.base.geometry import fit_similarity_l1, normalized
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.facts.warnings import graph_warnings, quality_warnings
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.grade import largest_sigmas, uncertain_cameras
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.diagnosis import diagnose
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.solver.program import differences

@@ -124,7 +124,7 @@ def measure_scene(name: str, args: argparse.Namespace) -> list[Row]:
     """Run all mappers on one scene, each in a fresh process."""
     with tempfile.TemporaryDirectory() as temporary:
         kept_in = args.folder or Path(temporary)
-        folder = _make(name, kept_in) if name in MADE or name in FURTHER else args.data / name
+        folder = make_scene(name, kept_in) if name in MADE or name in FURTHER else args.data / name
         truth = folder / "gt" if (folder / "gt").exists() else folder / "sparse" / "0"
         database, variables = folder / "database.db", thread_environment(args.threads)
         settings = {"threads": args.threads, "versions": versions(["pycolmap"]), "scene": name}
@@ -146,7 +146,7 @@ def measure_scene(name: str, args: argparse.Namespace) -> list[Row]:
         return judge(name, ours, peers)
 
 
-def _make(name: str, folder: Path) -> Path:
+def make_scene(name: str, folder: Path) -> Path:
     """Make a scene in a folder unless it has it, and return its own folder."""
     out = folder / name.replace(": ", "-").replace(" ", "-")
     if not out.exists() and name in MADE:

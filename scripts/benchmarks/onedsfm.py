@@ -29,8 +29,8 @@ from harness.record import Row, number, text_of
 from paper.baselines import FILTERS, locate_least_squares
 from sfm_shapefit import ViewGraph, place
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.graph.measured import MeasuredGraph
-from sfm_shapefit.pipeline.place import place_graph_file
 from sfm_shapefit.placement.place import order_pieces
 from sfm_shapefit.refinement import starts
 from sfm_shapefit.solver.program import differences

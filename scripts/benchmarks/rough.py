@@ -26,8 +26,8 @@ import sfm_shapefit
 from harness.driver import ROOT, Benchmark, Case, if_there
 from harness.process import Timed, time_call
 from harness.record import Row, at_least, at_most, ratio
+from sfm_shapefit.commands.convert import convert
 from sfm_shapefit.facts.warnings import wrong_rotations
-from sfm_shapefit.pipeline.convert import convert
 
 BUNDLED = {"courtyard": "truth", "photographed": "truth", "ring8": "sparse/0"}
 REAL = ("castle-P30", "Herz-Jesus-P25", "fountain-P11", "lego100")

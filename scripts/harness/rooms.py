@@ -19,7 +19,8 @@ FLOORS = (
     ("judgement",),
     ("facts",),
     ("report",),
-    ("pipeline", "synthetic/fixtures"),
+    ("pipeline",),
+    ("commands", "synthetic/fixtures"),
     ("cli", "__main__"),
 )
 ROOMS = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}

@@ -284,7 +284,7 @@ def is_noted(name: str, source_folder: Path) -> bool:
 
 
 def _note_name(name: str) -> str:
-    stamp = stamp_of(PACKAGE / "pipeline" / "examples.py")
+    stamp = stamp_of(PACKAGE / "commands" / "examples.py")
     return f"{name}-{RUNTIME}-{stamp}-{choose_target()}.nbc"
 
 

@@ -99,16 +99,16 @@ def check_command(
             )
             pieces = _check_pieces(source, database, not no_second_opinion, as_json=as_json, quiet=quiet)
             if strict:
-                _be_strict(is_usable=pieces.is_usable, has_matches=pieces.has_matches)
+                _be_strict(is_usable=bool(pieces.kept), has_matches=pieces.has_matches)
             return
         refuse_no_model(source)
         from sfm_shapefit.base.atomic_folder import claimed_output
+        from sfm_shapefit.commands.check import check
+        from sfm_shapefit.commands.write import refuse_file
         from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
-        from sfm_shapefit.pipeline.check import check
         from sfm_shapefit.pipeline.inputs import choose_inputs
         from sfm_shapefit.pipeline.lengths import judge_bars
-        from sfm_shapefit.pipeline.write import refuse_file
 
         known = choose_inputs(source, database).database
         if second_opinion is not None and no_second_opinion:
@@ -202,8 +202,8 @@ def _check_pieces(
     folder: Path, database: Path | None, second_opinion: bool, *, as_json: bool, quiet: bool
 ) -> "CheckedPieces":
     """Judge the models in a folder, print one table, and return what was found."""
+    from sfm_shapefit.commands.check import check_pieces
     from sfm_shapefit.files.colmap.quiet import hear_pycolmap
-    from sfm_shapefit.pipeline.check import check_pieces
 
     with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
         found = check_pieces(folder, database, second_opinion=second_opinion, progress=progress)

@@ -140,7 +140,7 @@ def answer_for(flag: str, known: Set[str]) -> str | None:
 
 
 def answer_for_file(names: Iterable[str], known: Set[str]) -> str | None:
-    """Return what options of a file of COLMAP's are here, by names as Mapper.min_num_matches; None if none is.
+    """Return what options of a file are here, by names as Mapper.min_num_matches; None if none is COLMAP's.
 
     The command has the `known` flags and keys of a file.
     """

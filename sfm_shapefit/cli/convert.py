@@ -9,7 +9,7 @@ from sfm_shapefit.base.display import NextStep
 from sfm_shapefit.cli.console import print_lines, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, OutputPath, Quiet, one_path
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.pipeline.convert import FORMATS, write_converted
+from sfm_shapefit.commands.convert import FORMATS, write_converted
 
 _DESCRIBED = "; ".join(f"{name}: {one.help}" for name, one in FORMATS.items())
 

@@ -94,9 +94,9 @@ def evaluate_command(
     with report_errors():
         from sfm_shapefit.base.atomic_folder import atomic_file
         from sfm_shapefit.base.paths import refuse_absent
+        from sfm_shapefit.commands.evaluate import evaluate, evaluate_against_table
+        from sfm_shapefit.commands.write import refuse_file
         from sfm_shapefit.facts.tables import write_records
-        from sfm_shapefit.pipeline.evaluate import evaluate, evaluate_against_table
-        from sfm_shapefit.pipeline.write import refuse_file
 
         if csv is not None:
             refuse_absent(source, truth)

@@ -61,7 +61,7 @@ class Run(Generic[S]):
 
         The command ends with exit code 4, if that was asked for and the model is not to be used.
         """
-        from sfm_shapefit.pipeline.write import WriteOptions, deliver
+        from sfm_shapefit.commands.write import WriteOptions, deliver
 
         flags = self.flags
         how: dict[str, Any] = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
@@ -76,7 +76,7 @@ class Run(Generic[S]):
 
     def _tell(self, found: "Result", source: Path, out: Path) -> None:
         """Print the details if they are wanted, the answer, the verdict, and what to do next."""
-        from sfm_shapefit.pipeline.write import has_colors
+        from sfm_shapefit.commands.write import has_colors
 
         told, pages = found.told, [str(out / folder / "report.html") for folder in found.told.folders]
         if self.flags.verbose:

@@ -53,7 +53,7 @@ def inspect_command(
         options = read_options(InspectOptions, given, config)
         refuse_no_model(source)
 
-        from sfm_shapefit.pipeline.inspect import inspect as inspect_model
+        from sfm_shapefit.commands.inspect import inspect as inspect_model
 
         with show_progress(not as_json) as progress:
             found = inspect_model(source, database, options=options, progress=progress)

@@ -35,7 +35,7 @@ def join_command(
         raise typer.BadParameter("give two models or more, and then OUT")
     *models, target = paths
     with command_run(JoinOptions, given, target, [*models, database], "MODEL MODEL... OUT") as run:
-        from sfm_shapefit.pipeline.join import join
+        from sfm_shapefit.commands.join import join
 
         found = join(models, database, options=run.options, progress=run.progress)
         run.finish(found, models[0], target)

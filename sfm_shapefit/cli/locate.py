@@ -52,8 +52,8 @@ def locate_command(
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
     with command_run(LocateOptions, given, target, [source, database, priors]) as run:
+        from sfm_shapefit.commands.locate import locate
         from sfm_shapefit.pipeline.execution import open_client
-        from sfm_shapefit.pipeline.locate import locate
 
         with open_client(scheduler) as client:
             found = locate(

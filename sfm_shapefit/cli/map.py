@@ -72,8 +72,8 @@ def map_command(
     target = one_path(out, output_path, "OUT")
     made = _database_to_make(source, target, given)
     with command_run(MapOptions, given, target, [source, priors], "DATABASE OUT", made) as run:
+        from sfm_shapefit.commands.map import map_database
         from sfm_shapefit.pipeline.execution import open_client
-        from sfm_shapefit.pipeline.map import map_database
 
         if made is not None:
             _match(source, made, given, run)
@@ -100,7 +100,7 @@ def _database_to_make(source: Path, target: Path, given: dict[str, Any]) -> Path
 
 def _match(images: Path, database: Path, given: dict[str, Any], run: Run[MapOptions]) -> None:
     """Make the database, and let the report have the images."""
-    from sfm_shapefit.pipeline.match import match_images
+    from sfm_shapefit.commands.match import match_images
 
     matching = read_options(MatchingOptions, given)
     threads = run.options.placement.solver.threads

@@ -63,7 +63,7 @@ def place_command(
     if any((source / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
         raise typer.BadParameter(f"{source} is a COLMAP model, which sfm-shapefit locate takes")
     with command_run(PlacementOptions, given, target, [source, rotations], "GRAPH OUT") as run:
-        from sfm_shapefit.pipeline.place import place_graph_file
+        from sfm_shapefit.commands.place import place_graph_file
 
         found = place_graph_file(
             source,

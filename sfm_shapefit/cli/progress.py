@@ -54,7 +54,7 @@ def show_progress(
     at work after `patience_s`.
     """
     from sfm_shapefit.base.jit import on_compilation
-    from sfm_shapefit.pipeline.warm_up import compile_together
+    from sfm_shapefit.commands.warm_up import compile_together
 
     course = Course(plan, time.monotonic())
     lines = _tell_lines(course, 0.0 if verbose else patience_s)

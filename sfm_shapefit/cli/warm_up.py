@@ -21,7 +21,7 @@ def warm_up_command(*, quiet: Quiet = False) -> None:
     Without it a command compiles what it needs when it first needs it.
     """
     with report_errors():
-        from sfm_shapefit.pipeline.warm_up import WarmUpError, not_done, warm_up
+        from sfm_shapefit.commands.warm_up import WarmUpError, not_done, warm_up
 
         with show_progress(not quiet) as progress:
             done = warm_up(not_done(), partial(progress, "compiling kernels") if progress else None)

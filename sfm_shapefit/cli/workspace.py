@@ -56,7 +56,7 @@ def workspace_command(
     target = one_path(out, output_path, "OUT")
     with report_errors(target):
         options = read_options(UndistortionOptions, given)
-        from sfm_shapefit.pipeline.workspace import workspace
+        from sfm_shapefit.commands.workspace import workspace
 
         with show_progress(not quiet, plan=PLANS["MODEL IMAGES OUT"]) as progress:
             made = workspace(source, folder, target, options=options, progress=progress)

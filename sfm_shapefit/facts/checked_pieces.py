@@ -69,11 +69,6 @@ class CheckedPieces(Record, Displayed, repr=False):
         return sorted(kept, key=lambda one: -one[1].num_placed)
 
     @property
-    def is_usable(self) -> bool:
-        """Whether one is to be kept."""
-        return bool(self.kept)
-
-    @property
     def has_matches(self) -> bool:
         """Whether those to be kept were compared with matches, and not with their own tracks alone."""
         return all(facts.has_matches for _, facts in self.kept)

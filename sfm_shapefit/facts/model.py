@@ -385,11 +385,11 @@ class CheckedFacts(FactsOfModel):
         if verdict.doubts_database:
             text = "Next: check it against the database that it was made from."
             return NextStep(text, f"sfm-shapefit check {path} --database ITS_DATABASE")
-        if self.options:  # `locate` and `map` would make the same again
-            text = "Next: see which of its pairs contradict one another."
-            return NextStep(text, f"sfm-shapefit inspect {path}{self.inputs.database_flag}")
         text = "Next: place the cameras anew from their rotations and matches, and compare."
-        return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
+        step = f"locate {path} located"
+        if self.options:  # `locate` and `map` would make the same again
+            text, step = "Next: see which of its pairs contradict one another.", f"inspect {path}"
+        return NextStep(text, f"sfm-shapefit {step}{self.inputs.database_flag}")
 
     def _next_of_evidence(self, path: str) -> NextStep:
         """Return how to get more evidence: from photographs, or from all pairs of them if asked."""
@@ -438,6 +438,7 @@ class CheckedFacts(FactsOfModel):
 class JoinedFacts(CheckedFacts):
     """locate.json of joined models, those of `map` in joined_0: looked at, not placed anew."""
 
+    options: Options
     models: Annotated[list[str], "The folders of the models in it."]
     joins: Annotated[list[JoinFacts], "How they were joined."]
     scale_sigma: Annotated[float | None, "Relative standard deviation of the scale; null if not known."]

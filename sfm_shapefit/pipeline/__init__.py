@@ -1,1 +1,1 @@
-"""The commands as functions: read, measure, place, seed, write. Each is a page; its steps stand beside it."""
+"""The stages of the commands: measure, place, adjust, judge, seed, set the gauge, ask for evidence."""

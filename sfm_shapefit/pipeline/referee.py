@@ -33,7 +33,7 @@ from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.scale_bars import MeasuredBars
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table, contradicting
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table, contradicting, model_options
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -248,7 +248,7 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
     facts = CheckedFacts(
         inputs=source.inputs.facts,
         images=str(source.inputs.images) if source.inputs.images else None,
-        options={},
+        options=model_options(source.inputs.folder),
         verdict=state.verdict,
         num_images=len(cameras),
         num_placed=state.images.num_images,

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.pipeline.locate import locate
-from sfm_shapefit.pipeline.write import write_result
+from sfm_shapefit.commands.locate import locate
+from sfm_shapefit.commands.write import write_result
 from tests.abuse.fuzz import STAGES_OF_MAP
 from tests.abuse.layouts import MODEL_FILES, binary_fields, cut_records, read_field
 from tests.program import run_python

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm_shapefit.pipeline.locate import locate
-from sfm_shapefit.pipeline.write import write_result
+from sfm_shapefit.commands.locate import locate
+from sfm_shapefit.commands.write import write_result
 from tests.abuse import determinism, verdicts
 from tests.abuse.fuzz import make_base
 from tests.program import run_python

@@ -189,7 +189,7 @@ def test_a_stamp_covers_what_a_module_imports_also_through_others(tmp_path):
 
 
 def test_a_note_holds_for_its_sources_only(folder):
-    own = kernel_cache.PACKAGE / "pipeline"
+    own = kernel_cache.PACKAGE / "commands"
     assert not is_noted("an example", own)
     note("an example", own)
     assert is_noted("an example", own)

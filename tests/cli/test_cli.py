@@ -17,12 +17,12 @@ import sfm_shapefit
 from sfm_shapefit.base import atomic_folder as output
 from sfm_shapefit.base.settings import setting_groups
 from sfm_shapefit.cli import app
+from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.facts.command_options import LocateOptions
 from sfm_shapefit.facts.placed import UNITS
 from sfm_shapefit.files.colmap.sqlite_file import database_in
 from sfm_shapefit.files.graph_text import graph_text
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.report.first_screen import tiles
 from sfm_shapefit.report.results import draw_result
 from tests.problems import all_pairs, exact_graph
@@ -535,7 +535,7 @@ def test_a_signal_while_writing_leaves_nothing(tmp_path):
     script = f"""
 import os, signal, sys
 from sfm_shapefit import cli
-from sfm_shapefit.pipeline import write as files
+from sfm_shapefit.commands import write as files
 files.write_rows = lambda *_: os.kill(os.getpid(), signal.SIGTERM)
 sys.argv = ["sfm-shapefit", "locate", {str(RING_MODEL)!r}, {str(tmp_path / "out")!r}]
 cli.main()

@@ -102,7 +102,7 @@ def test_a_full_device_a_closed_stdout_and_a_reader_that_has_left_end_quietly():
 
 def test_a_working_folder_that_is_removed_meanwhile_is_told(tmp_path):
     script = (
-        "import os, sys\nfrom sfm_shapefit.pipeline import locate as stages\n"
+        "import os, sys\nfrom sfm_shapefit.commands import locate as stages\n"
         "from sfm_shapefit.cli import main\n"
         "make = stages.make_model\n"
         "def remove(*given, **options):\n    os.rmdir(os.getcwd())\n    return make(*given, **options)\n"

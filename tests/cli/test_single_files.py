@@ -12,7 +12,7 @@ import pytest
 
 from sfm_shapefit.base.atomic_folder import atomic_file
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.pipeline.check import check
+from sfm_shapefit.commands.check import check
 from tests.program import run, run_python, run_refused
 from tests.scenes import COURTYARD, RING, ROOT, copied, fingerprint
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sfm_shapefit import synthetic
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.facts.placed import Delivered
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.solver.solver_options import Status
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.commands.evaluate import evaluate
 from sfm_shapefit.files.colmap import model_arrays, sqlite_file
 from sfm_shapefit.files.colmap.database import find_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
@@ -22,7 +23,6 @@ from sfm_shapefit.files.colmap.lenses import lens_of, rays_of
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.files.colmap.read_binary import read_folder
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
-from sfm_shapefit.pipeline.evaluate import evaluate
 from sfm_shapefit.scene.matches import PLENTY, Reading
 from tests.scenes import COURTYARD, edit_database, fingerprint, view_of
 

@@ -8,14 +8,14 @@ import pycolmap
 import pytest
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.commands.convert import convert
+from sfm_shapefit.commands.evaluate import evaluate
+from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself, read_list
 from sfm_shapefit.files.colmap.reconstructions import reconstruction_of
 from sfm_shapefit.files.listed_names import find_images
 from sfm_shapefit.files.nerf import read_nerf
 from sfm_shapefit.files.tum import read_tum
-from sfm_shapefit.pipeline.convert import convert
-from sfm_shapefit.pipeline.evaluate import evaluate
-from sfm_shapefit.pipeline.locate import locate
 from tests.models import poses_of
 from tests.program import run
 from tests.scenes import COURTYARD, RING, copied, edit_database

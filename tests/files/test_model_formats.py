@@ -21,13 +21,13 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import rotation_angles_deg
+from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.other_programs import model_of_opensfm, relative_poses_of
 from sfm_shapefit.files.glomap_text import is_relative_poses, read_relative_poses
 from sfm_shapefit.files.nerf import nerf_text
 from sfm_shapefit.files.opensfm import read_opensfm
 from sfm_shapefit.files.tum import poses_csv, tum_text
-from sfm_shapefit.pipeline.place import place_graph_file
 from sfm_shapefit.scene.lens import Lens
 from tests.program import run
 from tests.scenes import COURTYARD, RING

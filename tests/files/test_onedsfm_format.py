@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity, normalized, tangent_bases
+from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.files.g2o import is_g2o, read_g2o, read_g2o_rotations
 from sfm_shapefit.files.onedsfm import is_onedsfm, read_onedsfm, read_rotations
-from sfm_shapefit.pipeline.place import place_graph_file
 from tests.scenes import real_scene
 
 IDENTITY = "1 0 0 0 1 0 0 0 1"

@@ -8,9 +8,9 @@ import pycolmap
 import pytest
 
 from sfm_shapefit import InputError, locate
+from sfm_shapefit.commands.evaluate import evaluate_against_table
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors, exif_priors, table_priors
-from sfm_shapefit.pipeline.evaluate import evaluate_against_table
 from tests.scenes import RING, read_from
 
 MODEL = RING / "sparse" / "0"

@@ -5,8 +5,8 @@ import pytest
 
 from harness.graphs import relative_error
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.facts.warnings import quality_warnings
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import box_graph_problem, community_graph_problem, random_graph_problem
 

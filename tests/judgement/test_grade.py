@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit import synthetic
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import weigh_evidence
@@ -13,7 +14,6 @@ from sfm_shapefit.judgement.graph_grade import judge_graph
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.support import EvidenceShares
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.placement.second_configuration import Found, SecondConfiguration
 from tests.judgement.made import group_apart, place_of, untied_group, wrong_lens

@@ -7,14 +7,14 @@ import numpy as np
 import pycolmap
 import pytest
 
+from sfm_shapefit.commands.check import check
+from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import weigh_evidence
 from sfm_shapefit.judgement.image_quality import image_quality
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason
-from sfm_shapefit.pipeline.check import check
-from sfm_shapefit.pipeline.map import map_database
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from tests.facts.test_schema import problems

@@ -9,11 +9,11 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import FLIP_YZ, fit_similarity
+from sfm_shapefit.commands.check import check
+from sfm_shapefit.commands.convert import convert
 from sfm_shapefit.judgement.conventions import recognize_convention
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.check import check
-from sfm_shapefit.pipeline.convert import convert
 from tests.models import centers_of, posed
 from tests.scenes import COURTYARD, RING, copied, edit_database
 

@@ -4,9 +4,9 @@ import sqlite3
 
 import pytest
 
+from sfm_shapefit.commands.locate import locate
+from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
-from sfm_shapefit.pipeline.locate import locate
-from sfm_shapefit.pipeline.map import map_database
 from tests.program import run, run_refused
 from tests.scenes import RING, copied, edit_database
 

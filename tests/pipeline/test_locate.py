@@ -11,9 +11,9 @@ import sfm_shapefit
 from scripts.make_data import SCENES  # the one place that knows how a bundled scene was made
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.commands.write import write_result
 from sfm_shapefit.files.colmap.read_binary import read_folder
 from sfm_shapefit.files.colmap.reconstructions import points2d_xy
-from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene, write_workspace
 from tests.models import centers_of, posed

@@ -7,10 +7,10 @@ import pycolmap
 import pytest
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.commands.check import check
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.chosen_pairs import Shared, choose_pairs
 from sfm_shapefit.judgement.reasons import Grade
-from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions, make_rendered_scene
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from tests.program import run, run_refused

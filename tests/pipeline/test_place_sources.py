@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity, normalized
+from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.files.graph_text import graph_text, read_graph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.place import place_graph_file
 from sfm_shapefit.synthetic import random_graph_problem
 from tests.files.test_onedsfm_format import egs_text, folder_with, rots_text, scene, write_scene
 from tests.program import run

@@ -13,16 +13,16 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit import InputError, LocateOptions
 from sfm_shapefit.base.geometry import fit_similarity, rotation_angles_deg
+from sfm_shapefit.commands.convert import convert
+from sfm_shapefit.commands.write import write_result
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.listed_poses import read_list
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import template_of
-from sfm_shapefit.pipeline.convert import convert
 from sfm_shapefit.pipeline.model_joins import judge_joins
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
-from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 from sfm_shapefit.placement.gauge_rule import GaugeRule
 from sfm_shapefit.scene.points import number_points

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
+from sfm_shapefit.commands.convert import convert
 from sfm_shapefit.facts.warnings import rotation_warnings, wrong_rotations
-from sfm_shapefit.pipeline.convert import convert
 from tests.models import posed
 from tests.scenes import BUNDLED, COURTYARD, PHOTOGRAPHED, RING, edit_database
 

@@ -4,8 +4,8 @@ import numpy as np
 import pycolmap
 
 import sfm_shapefit
+from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.judgement.reasons import Grade
-from sfm_shapefit.pipeline.map import map_database
 from tests.scenes import edit_database, real_scene
 
 

@@ -7,9 +7,9 @@ from numba.core import config
 
 from sfm_shapefit.base import kernel_cache
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.pipeline import examples
-from sfm_shapefit.pipeline import warm_up as module
-from sfm_shapefit.pipeline.warm_up import FURTHER, NEEDED, WarmUp, compile_together, not_done, warm_up
+from sfm_shapefit.commands import examples
+from sfm_shapefit.commands import warm_up as module
+from sfm_shapefit.commands.warm_up import FURTHER, NEEDED, WarmUp, compile_together, not_done, warm_up
 from tests.program import run, run_python
 
 
@@ -26,7 +26,7 @@ HEAR = """
 import sys, tempfile
 from pathlib import Path
 from sfm_shapefit.base.kernel_cache import hear_of_kernels
-from sfm_shapefit.pipeline import examples
+from sfm_shapefit.commands import examples
 heard = set()
 with hear_of_kernels(heard.add), tempfile.TemporaryDirectory() as folder:
     for name in ("solve_sparse", "solve_by_splitting", "solve_iteratively"):
@@ -53,14 +53,14 @@ def test_an_example_tells_of_its_kernels_and_one_that_fails_says_why():
     assert list(ready) == sorted(ready)
     assert 3 <= ready[-1] < totals[0]
     assert 100 < totals[0] < 1000
-    assert kernel_cache.is_noted("find_pieces", kernel_cache.PACKAGE / "pipeline")
-    assert not kernel_cache.is_noted("no_such_example", kernel_cache.PACKAGE / "pipeline")
+    assert kernel_cache.is_noted("find_pieces", kernel_cache.PACKAGE / "commands")
+    assert not kernel_cache.is_noted("no_such_example", kernel_cache.PACKAGE / "commands")
 
 
 KILLED = """
 import multiprocessing, os
 from pathlib import Path
-from sfm_shapefit.pipeline.warm_up import warm_up
+from sfm_shapefit.commands.warm_up import warm_up
 scratch = Path(os.environ["TMPDIR"])
 def kill(_ready, _total):
     print(len(list(scratch.glob("*/find_pieces"))))
@@ -106,7 +106,7 @@ def no_process(_how):
 def test_what_is_not_done_are_the_examples_that_never_ran(cold):
     assert not_done() == [*NEEDED, *FURTHER]
     for name in NEEDED[1:]:
-        kernel_cache.note(name, kernel_cache.PACKAGE / "pipeline")
+        kernel_cache.note(name, kernel_cache.PACKAGE / "commands")
     assert not_done(NEEDED) == [NEEDED[0]]
 
 
@@ -114,7 +114,7 @@ def test_what_is_not_done_are_the_examples_that_never_ran(cold):
 def test_a_wheel_for_another_numba_is_told_of(cold, monkeypatch, other):
     monkeypatch.setattr(module, "made_for", lambda: other or kernel_cache.here())
     for name in NEEDED:  # so that a miss starts no process
-        kernel_cache.note(name, kernel_cache.PACKAGE / "pipeline")
+        kernel_cache.note(name, kernel_cache.PACKAGE / "commands")
     said = []
     assert compile_anew(said.append) == 42
     assert len(said) == bool(other)
@@ -137,7 +137,7 @@ def test_the_command_says_what_is_ready_or_what_failed(monkeypatch):
 COLD = """
 import numpy as np
 from sfm_shapefit.cli.progress import show_progress
-from sfm_shapefit.pipeline import warm_up
+from sfm_shapefit.commands import warm_up
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 warm_up.NEEDED = ("find_pieces",)
 with show_progress(True, verbose=True):

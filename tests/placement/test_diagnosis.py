@@ -7,10 +7,10 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import UnsolvableError, synthetic
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.files.graph_text import graph_text
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.placement.diagnosis import diagnose
 from sfm_shapefit.refinement.placement_options import PlacementOptions

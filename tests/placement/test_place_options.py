@@ -6,12 +6,12 @@ import pytest
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.settings import homes_of
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import judge
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.gauge import prior_gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors

@@ -7,13 +7,13 @@ import pytest
 
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.facts.rows import camera_rows, pair_rows
 from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.graph_grade import judge_graph
 from sfm_shapefit.judgement.judged import judge
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.place import Placement, place_pieces
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.solver.program import differences

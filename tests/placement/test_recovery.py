@@ -10,7 +10,7 @@ import pytest
 
 from sfm_shapefit import synthetic
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.pipeline.place import place
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.solver.program import differences
 from tests.problems import fit_angles, shape_error
 

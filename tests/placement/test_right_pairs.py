@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit import synthetic
-from sfm_shapefit.pipeline.place import place, place_graph_file
+from sfm_shapefit.commands.place import place, place_graph_file
 from sfm_shapefit.placement.right_pairs import examine_right_pairs
 from sfm_shapefit.solver.solver_options import SolverOptions
 from tests.problems import shape_error

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.second_configuration import find_second_configuration
 from sfm_shapefit.synthetic import box_graph_problem, random_graph_problem
 

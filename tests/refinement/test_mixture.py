@@ -6,11 +6,11 @@ import pytest
 from sfm_shapefit import synthetic
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity_l1, normalized
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.factor import analyze, factorize
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement.length_prior import LengthPrior
 from sfm_shapefit.refinement.mixture import Mixture
 from tests.graph_families import random_blocks

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.geometry import median_spread, normalized
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement.angular import KERNEL_WIDTH
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, left_scene, openness, put_back

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sfm_shapefit import synthetic
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement.consensus import fit_mixture, penalty_of_strays, put_by_consensus
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.solver_options import SolverOptions

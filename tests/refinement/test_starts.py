@@ -7,10 +7,10 @@ import pytest
 
 from sfm_shapefit import synthetic
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.refinement.starts import COLLAPSED, Start, choose_start, disagreement, refine_starts
 from sfm_shapefit.solver.program import differences

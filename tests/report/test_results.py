@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.pipeline.locate import locate
-from sfm_shapefit.pipeline.map import map_database
+from sfm_shapefit.commands.locate import locate
+from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.report.charts import residuals_of_states
 from sfm_shapefit.report.drawing import PairClass, input_centers
 from sfm_shapefit.report.results import draw_result

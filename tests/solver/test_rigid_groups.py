@@ -5,10 +5,10 @@ import pytest
 
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.commands.place import place
 from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional

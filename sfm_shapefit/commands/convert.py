@@ -133,12 +133,12 @@ def write_converted(
     """Write a model in another format, in a system and with an offset; `convert` raises the same."""
     # Here, so that the command line knows the formats without loading pycolmap.
     from sfm_shapefit.base.paths import refuse_absent
+    from sfm_shapefit.commands.write import refuse_file
     from sfm_shapefit.facts.tables import model_datum
     from sfm_shapefit.files.colmap.listed_poses import read_by_itself
     from sfm_shapefit.files.colmap.model import model_of, read_model
     from sfm_shapefit.files.colmap.reconstructions import transform_model
     from sfm_shapefit.files.colmap.world import world_of
-    from sfm_shapefit.pipeline.write import refuse_file
 
     name = target_format or _format_of(path)
     if name not in FORMATS:

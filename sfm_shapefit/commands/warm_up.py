@@ -1,6 +1,6 @@
 """`warm-up`: compile all kernels at once, by running small examples.
 
-What compiles a kernel is a call with arguments of the right types, so `pipeline.examples` calls everything.
+What compiles a kernel is a call with arguments of the right types, so `commands.examples` calls everything.
 Processes, one per core, take one example after the other and tell of each kernel that they compile or find.
 What they compile is kept on disk, see `kernel_cache`, and so is the name of each example that is done. A
 command that misses a kernel lets the examples that commands need run first, if they never did, and goes on
@@ -93,7 +93,7 @@ class WarmUp:
 def warm_up(examples: Sequence[str], report: Tell | None = None) -> WarmUp:
     """Compile the kernels that examples need and keep them on disk, in as many processes as there are cores.
 
-    Examples are names of functions of `pipeline.examples`; `report` is called whenever a kernel is ready.
+    Examples are names of functions of `commands.examples`; `report` is called whenever a kernel is ready.
     """
     if not examples:
         return WarmUp(0, ())
@@ -135,7 +135,7 @@ def compile_together(report: Tell, say: Callable[[str], None]) -> Iterator[None]
 
 def not_done(examples: Sequence[str] = NEEDED + FURTHER) -> list[str]:
     """Return the examples that never ran with these sources, on this kind of processor."""
-    return [name for name in examples if not is_noted(name, PACKAGE / "pipeline")]
+    return [name for name in examples if not is_noted(name, PACKAGE / "commands")]
 
 
 def num_cores() -> int:
@@ -205,12 +205,12 @@ def _work(connection: Any, scratch: str, objects_between_searches: tuple[int, in
         connection.send(None)
         while name := connection.recv():
             try:
-                from sfm_shapefit.pipeline import examples
+                from sfm_shapefit.commands import examples
 
                 folder = Path(scratch, name)
                 folder.mkdir()
                 getattr(examples, name)(folder)
-                note(name, PACKAGE / "pipeline")
+                note(name, PACKAGE / "commands")
             except Exception as error:  # whatever it is, the others are worth running
                 connection.send(WarmUpError(f"{name}: {type(error).__name__}: {error}"))
             connection.send(None)

@@ -9,18 +9,18 @@ import numpy.typing as npt
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.commands.pose_graphs import (
+    MAX_ROTATION_ERROR_DEG,
+    orient_pose_graph,
+    read_pose_graph,
+    without_contradicted,
+)
 from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.result import GraphResult
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.graph.measured import MeasuredGraph, direction_covariances
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import judge
-from sfm_shapefit.pipeline.pose_graphs import (
-    MAX_ROTATION_ERROR_DEG,
-    orient_pose_graph,
-    read_pose_graph,
-    without_contradicted,
-)
 from sfm_shapefit.placement.place import place_pieces
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.solver.solver_options import OnIteration, reported

@@ -3,16 +3,15 @@
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.commands.map import map_database, map_opened
 from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import MapResult
-from sfm_shapefit.facts.tables import told_of
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself, read_source
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
@@ -21,7 +20,6 @@ from sfm_shapefit.files.model_folder import model_folders
 from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
-from sfm_shapefit.pipeline.map import map_database, map_opened
 from sfm_shapefit.pipeline.pictures import match_pictures
 from sfm_shapefit.pipeline.referee import CheckResult, OtherModel, check_source
 from sfm_shapefit.scene.images import Images
@@ -77,16 +75,7 @@ def check(
                 if not inputs.is_found:
                     raise
                 file.notes.append(f"there is no second opinion: {error}")
-        found = check_source(posed, source, DirectionOptions(), clock, other)
-    return replace(found, facts=replace(found.facts, options=_made_with(model)))
-
-
-def _made_with(model: ModelSource) -> dict[str, Any]:
-    """Return the options with which `locate` or `map` made a model; none of another one."""
-    try:
-        return told_of(model, "options", dict) or {}
-    except InputError:  # another program's locate.json, or a damaged one
-        return {}
+        return check_source(posed, source, DirectionOptions(), clock, other)
 
 
 def _map_anew(

@@ -1,4 +1,4 @@
-"""Small examples of all that commands do: running them compiles every kernel, see `pipeline.warm_up`.
+"""Small examples of all that commands do: running them compiles every kernel, see `commands.warm_up`.
 
 An example takes an empty folder for its files, and a fraction of a second once its kernels are compiled.
 """

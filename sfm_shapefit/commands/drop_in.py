@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.commands.map import map_database, measure_run
+from sfm_shapefit.commands.write import WriteOptions, deliver
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pipeline.components import start_run
 from sfm_shapefit.pipeline.execution import workers_of
-from sfm_shapefit.pipeline.map import map_database, measure_run
-from sfm_shapefit.pipeline.write import WriteOptions, deliver
 from sfm_shapefit.scene.points import number_points
 
 if TYPE_CHECKING:
