@@ -118,7 +118,7 @@ class KeyFigures(Record):
         """Say how uncertain a position is; `sigma_of` as of `Facts`."""
         share = self.sigma_of_extent
         if self.sigma is None or share is None or share > 1.0:
-            return "how well positions are known is not known"
+            return "the uncertainty of positions is not known"
         is_metric = self.sigma_unit not in (UNITS["input"], UNITS["unit"], SOLVER_UNITS)
         measured = f" ({self.sigma:.2g} {self.sigma_unit})" if is_metric else ""
         return f"positions known to ± {100.0 * share:.2g} % of the scene{measured}{scope_of(sigma_of)}"

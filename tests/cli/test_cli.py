@@ -74,7 +74,7 @@ def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
     assert told.lines[2] == "positions known to ± 12 % of the scene"
     assert told.lines[0].startswith("8 of 8 images placed, ")
     lost = replace(facts, figures=replace(facts.figures, sigma_of_extent=1.5))
-    assert lost.told((), "").lines[2] == "how well positions are known is not known"
+    assert lost.told((), "").lines[2] == "the uncertainty of positions is not known"
     metric = replace(facts, figures=replace(facts.figures, sigma_unit=UNITS["prior"]))
     assert metric.told((), "").lines[2].endswith("12 % of the scene (0.5 of the priors' units)")
     assert figures.sigma == pytest.approx(np.median(drawing.cameras.sigmas[drawing.cameras.placed]))

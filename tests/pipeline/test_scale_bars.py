@@ -243,7 +243,7 @@ def test_lengths_that_are_none_are_told(ring):
     found = sfm_shapefit.evaluate_lengths(few, [("0001.jpg", "0002.jpg")])
     assert found.lengths == []
     assert found.warnings[-1].startswith(
-        "how well the distance of 0001.jpg and 0002.jpg is known is not known"
+        "nothing is known of the error of the distance of 0001.jpg and 0002.jpg"
     )
 
 
