@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.base.errors import ShapeFitError as ShapeFitError
     from sfm_shapefit.base.errors import UnsolvableError as UnsolvableError
     from sfm_shapefit.base.executors import WorkerError as WorkerError
+    from sfm_shapefit.commands.bundle_adjust import AdjustedModel as AdjustedModel
+    from sfm_shapefit.commands.bundle_adjust import bundle_adjust as bundle_adjust
     from sfm_shapefit.commands.check import check as check
     from sfm_shapefit.commands.check import check_pieces as check_pieces
     from sfm_shapefit.commands.convert import convert as convert
@@ -39,10 +41,12 @@ if TYPE_CHECKING:
     from sfm_shapefit.commands.evaluate import evaluate as evaluate
     from sfm_shapefit.commands.inspect import inspect as inspect
     from sfm_shapefit.commands.join import join as join
+    from sfm_shapefit.commands.lengths import evaluate_lengths as evaluate_lengths
     from sfm_shapefit.commands.locate import locate as locate
     from sfm_shapefit.commands.map import map_database as map_database
     from sfm_shapefit.commands.match import match_images as match_images
     from sfm_shapefit.commands.place import place as place
+    from sfm_shapefit.commands.relative_rotations import relative_rotations as relative_rotations
     from sfm_shapefit.commands.workspace import Workspace as Workspace
     from sfm_shapefit.commands.workspace import workspace as workspace
     from sfm_shapefit.commands.write import WriteOptions as WriteOptions
@@ -61,11 +65,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.graph.viewgraph import ViewGraph as ViewGraph
     from sfm_shapefit.judgement.trust_options import TrustOptions as TrustOptions
     from sfm_shapefit.pairs.direction_options import DirectionOptions as DirectionOptions
-    from sfm_shapefit.pipeline.bundle_adjust import AdjustedModel as AdjustedModel
-    from sfm_shapefit.pipeline.bundle_adjust import bundle_adjust as bundle_adjust
-    from sfm_shapefit.pipeline.lengths import evaluate_lengths as evaluate_lengths
     from sfm_shapefit.pipeline.referee import CheckResult as CheckResult
-    from sfm_shapefit.pipeline.relative_rotations import relative_rotations as relative_rotations
     from sfm_shapefit.placement.gauge_options import GaugeOptions as GaugeOptions
     from sfm_shapefit.placement.place import Placement as Placement
     from sfm_shapefit.refinement.placement_options import PlacementOptions as PlacementOptions
@@ -87,7 +87,7 @@ _HOMES = {
     "files.matching_options": ("MatchingOptions",),
     "files.undistortion_options": ("UndistortionOptions",),
     "adjustment.adjustment_options": ("AdjustmentOptions",),
-    "pipeline.bundle_adjust": ("AdjustedModel", "bundle_adjust"),
+    "commands.bundle_adjust": ("AdjustedModel", "bundle_adjust"),
     "commands.check": ("check", "check_pieces"),
     "pipeline.referee": ("CheckResult",),
     "commands.convert": ("convert",),
@@ -95,11 +95,11 @@ _HOMES = {
     "commands.evaluate": ("evaluate",),
     "commands.inspect": ("inspect",),
     "commands.join": ("join",),
-    "pipeline.lengths": ("evaluate_lengths",),
+    "commands.lengths": ("evaluate_lengths",),
     "commands.locate": ("locate",),
     "commands.map": ("map_database",),
     "commands.match": ("match_images",),
-    "pipeline.relative_rotations": ("relative_rotations",),
+    "commands.relative_rotations": ("relative_rotations",),
     "commands.workspace": ("Workspace", "workspace"),
     "commands.write": ("WriteOptions", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),

@@ -64,6 +64,11 @@ class Estimate:
     """How the solves went; the final error stands in it where the model's points are known."""
 
     @property
+    def num_draws(self) -> int:
+        """Number of draws of the errors; 0 where there are none."""
+        return 0 if self.draws is None else self.draws.shape[2]
+
+    @property
     def is_refined(self) -> BoolArray:
         """Lenses whose focal length was free, (l,)."""
         return ~np.isnan(self.focal_sigmas)

@@ -6,6 +6,12 @@ from pathlib import Path
 
 from sfm_shapefit.base.errors import InputError
 
+OF_DATABASE = "database"
+"""In place of a table or folder: what the database itself has."""
+SOLVED = "solved"
+"""In place of a file of names of images: those that observe a 3D point."""
+MASKS = "that of the masks, NAME.png for image NAME"
+
 
 def refuse_irregular_file(path: Path) -> None:
     """Refuse what is neither a file nor missing: reading a pipe waits for ever, and a device may have no end.
@@ -32,9 +38,6 @@ def refuse_absent(*paths: Path | None) -> None:
     for path in paths:
         if path is not None and not os.path.exists(path):
             raise InputError(f"{path} does not exist")
-
-
-MASKS = "that of the masks, NAME.png for image NAME"
 
 
 def refuse_no_folder(folder: Path, wanted: str = "the one that the names of the images start from") -> None:

@@ -104,11 +104,11 @@ def check_command(
         refuse_no_model(source)
         from sfm_shapefit.base.atomic_folder import claimed_output
         from sfm_shapefit.commands.check import check
+        from sfm_shapefit.commands.lengths import judge_bars
         from sfm_shapefit.commands.write import refuse_file
         from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.inputs import choose_inputs
-        from sfm_shapefit.pipeline.lengths import judge_bars
 
         known = choose_inputs(source, database).database
         if second_opinion is not None and no_second_opinion:

@@ -127,7 +127,7 @@ def _tell_lengths(source: Path, lengths: list[str], bars: Path | None, *, as_jso
     """Print how well lengths of a model are known."""
     with report_errors():
         from sfm_shapefit.base.paths import refuse_absent
-        from sfm_shapefit.pipeline.lengths import evaluate_lengths
+        from sfm_shapefit.commands.lengths import evaluate_lengths
 
         refuse_absent(source, *filter(None, [bars]))
         found = evaluate_lengths(source, [split_values("length", one) for one in lengths], scale_bars=bars)

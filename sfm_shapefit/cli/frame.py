@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Generic
 import typer
 
 from sfm_shapefit.base.display import row
+from sfm_shapefit.base.paths import OF_DATABASE, SOLVED
 from sfm_shapefit.base.settings import S, flat_values
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.cli.console import (
@@ -24,7 +25,6 @@ from sfm_shapefit.cli.console import (
 from sfm_shapefit.cli.flags import OutputFlags, read_options
 from sfm_shapefit.cli.forecast import PLANS
 from sfm_shapefit.cli.progress import show_progress
-from sfm_shapefit.facts.command_options import FIX_SOLVED
 from sfm_shapefit.files.matching_options import MADE_FIRST
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     Result = LocateResult | MapResult | GraphResult | JoinedModel
 
 _BLACK = "the points have none; --images FOLDER gives them those of the images"
-_IN_PLACE_OF_FILES = {"database", FIX_SOLVED}
+_IN_PLACE_OF_FILES = {OF_DATABASE, SOLVED}
 """Words that options take where else they take a file."""
 _NOTICED_S = 1.0  # seconds; a user does not notice less compiling
 

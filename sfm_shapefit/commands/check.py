@@ -9,6 +9,7 @@ import numpy as np
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.commands.map import map_database, map_opened
+from sfm_shapefit.commands.pictures import match_pictures
 from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import MapResult
@@ -20,7 +21,6 @@ from sfm_shapefit.files.model_folder import model_folders
 from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
-from sfm_shapefit.pipeline.pictures import match_pictures
 from sfm_shapefit.pipeline.referee import CheckResult, OtherModel, check_source
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images

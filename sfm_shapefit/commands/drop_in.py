@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.paths import OF_DATABASE
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.commands.map import map_database, measure_run
@@ -18,8 +19,6 @@ from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pipeline.components import start_run
 from sfm_shapefit.pipeline.execution import workers_of
-from sfm_shapefit.pipeline.known import PRIORS_OF_DATABASE
-from sfm_shapefit.rotations.averaging_options import GRAVITY_OF_DATABASE
 from sfm_shapefit.scene.points import number_points
 
 if TYPE_CHECKING:
@@ -113,8 +112,8 @@ def _options_of(theirs: "_PycolmapOptions", database: Path) -> tuple[MapOptions,
         _refuse_few_cameras(fixed, database)
         values["intrinsics"] = "held"
     if changed.pop("mapper.rotation_averaging.use_gravity", False):
-        values["gravity"] = GRAVITY_OF_DATABASE
-    priors = PRIORS_OF_DATABASE if changed.pop("use_prior_position", False) else None
+        values["gravity"] = OF_DATABASE
+    priors = OF_DATABASE if changed.pop("use_prior_position", False) else None
     ends = {name: name.rpartition(".")[2].removeprefix("ba_") for name in changed}
     kept = {"refine_focal_length", "refine_extra_params"} & {*ends.values()}
     if kept and not fixed:
@@ -132,9 +131,9 @@ def _refuse_few_cameras(fixed: set[int], database: Path) -> None:
         others = sorted(read_cameras(file).usable.keys() - fixed)
     if others:
         raise InputError(
-            f"constant_cameras lacks {counted(len(others), 'camera')} of the database, such as {others[0]}, and "
-            "intrinsics are held of all or of none; leave it out, and mark what is calibrated in the database "
-            "(has_prior_focal_length): calibrated lenses stay by default"
+            f"constant_cameras lacks {counted(len(others), 'camera')} of the database, such as {others[0]}, "
+            "and intrinsics are held of all or of none; leave it out, and mark in the database what is "
+            "calibrated (has_prior_focal_length): calibrated lenses stay by default"
         )
 
 

@@ -35,7 +35,7 @@ from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import widest_level
 from sfm_shapefit.pairs.triplets import score_triplets
-from sfm_shapefit.pipeline.bundle_adjust import read_bundle
+from sfm_shapefit.pipeline.bundle import read_bundle
 from sfm_shapefit.refinement.angular import allocate_normal, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rotations.annealing import anneal, follow_spanning_tree, refine_fully

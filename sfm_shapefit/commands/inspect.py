@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
@@ -11,15 +13,17 @@ from sfm_shapefit.facts.inspected import Inspection
 from sfm_shapefit.files.colmap.listed_poses import is_list, read_source
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.graph_text import read_graph
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.conventions import naming_convention
 from sfm_shapefit.pipeline.doubts import confirm_rotations
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.pipeline.measure import MeasureRequest, add_evidence, build_graph, measure, wants_points
 from sfm_shapefit.pipeline.memory import count_work, describe_work, forecast
-from sfm_shapefit.pipeline.placing import rigs_statement
 from sfm_shapefit.placement.diagnosis import diagnose
 from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.solver.tied import largest_tied
 
 
 def inspect(
@@ -91,3 +95,16 @@ def _is_graph(source: Path, database: Path | str | None) -> bool:
     """Return whether a source is a bare graph; a table is a trajectory if a database has its matches."""
     may_be_graph = not is_list(source) or (source.suffix.lower() in {".txt", ".csv"} and database is None)
     return source.is_file() and may_be_graph
+
+
+def rigs_statement(images: Images, measured: MeasuredGraph) -> str:
+    """Say how many frames there are, and how many of them the pairs tie to one another."""
+    groups, edges = measured.groups, measured.graph.edges
+    if groups is None:
+        return "none: every image is a frame of its own"
+    frames = f"{len(images.frames.ids)} frames of {images.num_images} images"
+    if not measured.has_scale:
+        return f"{frames}; no pair sees two cameras of a frame that are apart, so their scale is open"
+    sizes = measured.cameras_per_group
+    tied = int(np.sum(sizes[largest_tied(edges, groups, sizes)] > 0))
+    return f"{frames}, of which the pairs tie {tied} in metric scale; the pieces below take images one by one"

@@ -13,24 +13,19 @@ import numpy as np
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
-from sfm_shapefit.facts.command_options import LocateOptions
+from sfm_shapefit.facts.command_options import LocateOptions, pull_of_rotations
 from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.files.colmap.known import read_fixed_images, read_known
 from sfm_shapefit.files.colmap.listed_poses import read_source
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
 from sfm_shapefit.pipeline.execution import workers_of
-from sfm_shapefit.pipeline.inputs import (
-    RunInputs,
-    choose_inputs,
-    choose_intrinsics,
-    open_matches,
-    read_left_out,
-    see_matches,
-)
-from sfm_shapefit.pipeline.known import between_images, pull_of_rotations, read_fixed_images, read_known
+from sfm_shapefit.pipeline.inputs import RunInputs, choose_inputs, open_matches, read_left_out, see_matches
+from sfm_shapefit.pipeline.intrinsics import choose_intrinsics
 from sfm_shapefit.pipeline.memory import see_within_limit
 from sfm_shapefit.pipeline.remedies import make_model
+from sfm_shapefit.placement.gauge_rule import between_images
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -100,7 +95,8 @@ def locate(
             matches = stack.enter_context(closing(opened))
             wanted = options.freedom.intrinsics
             images, intrinsics = choose_intrinsics(given, matches, wanted, inputs.left_out, listed)
-            known = read_known(images, matches.file, priors, options.gauge)
+            files = {"control_points": gauge.control_points, "scale_bars": gauge.scale_bars}
+            known = read_known(images, matches.file, priors, **files)
             fixed = read_fixed_images(model, options.fix)
             has_database = matches.file is not None
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)

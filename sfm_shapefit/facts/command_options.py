@@ -3,6 +3,7 @@
 Pure data, and cheap to import. Each option is stated once, in the group of the stage that it belongs to.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,9 +19,6 @@ from sfm_shapefit.tracks.structure_options import NodeOptions, StructureOptions
 Rotations = Literal["auto", "held", "free"] | float
 Source = Literal["auto", "matches", "tracks"]
 Join = Literal["never", "safe"]
-
-FIX_SOLVED = "solved"
-"""In place of a file of names: fix every image that observes a 3D point of the input."""
 
 
 @explained
@@ -136,3 +134,10 @@ class MapOptions(Composed):
 
 PlacingOptions = LocateOptions | MapOptions
 """What the stages have in common that follow the rotations."""
+
+
+def pull_of_rotations(rotations: Rotations) -> float | None:
+    """Return by which standard deviation given rotations pull, see `Freedom`; None: as the matches say."""
+    if not isinstance(rotations, str):
+        return math.radians(rotations)
+    return {"auto": None, "held": 0.0, "free": math.inf}[rotations]

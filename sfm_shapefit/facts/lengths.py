@@ -5,12 +5,21 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.place_errors import Distances, PlaceErrors, ScaleErrors
+from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.place_errors import (
+    Distances,
+    PlaceErrors,
+    ScaleErrors,
+    draws_at,
+    errors_of_points,
+)
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import rounded
 from sfm_shapefit.facts.scale_bars import ScaleBar
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.points import Points
 
 WITHIN_95 = 1.96
 """Standard deviations; between them on either side lie 95 % of a normal distribution."""
@@ -165,3 +174,21 @@ def spread_rows(lengths: IntArray) -> IntArray:
     """Return rows of points (k,), spread evenly over those that as many images see as the median, or more."""
     usual = np.flatnonzero(lengths >= np.median(lengths)) if len(lengths) else lengths
     return usual[np.unique(np.linspace(0, len(usual) - 1, min(len(usual), _MOST_PLACES)).astype(np.int64))]
+
+
+def length_between(
+    images: Images, points: Points, estimate: Estimate | None, scale: ScaleErrors, axes: Axes
+) -> LengthFacts | None:
+    """Return how well a usual length between points of a model is known; None where it is not known."""
+    if estimate is None or estimate.draws is None or not points.num_points:
+        return None
+    return tell_usual_length(errors_of(images, points, estimate, spread_rows(points.lengths())), scale, axes)
+
+
+def errors_of(images: Images, points: Points, estimate: Estimate, chosen: IntArray) -> PlaceErrors:
+    """Return the errors of some points of a model, by their rows."""
+    rows = np.flatnonzero(images.is_posed)
+    observed = points.rows_of(chosen)
+    seen = observed.list_of_rows(), np.searchsorted(rows, points.images[observed.rows])
+    posed = images.part(rows)
+    return errors_of_points(posed, draws_at(estimate, posed), points.xyz[chosen], seen, estimate.noise_px)

@@ -5,12 +5,16 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.place_errors import Distances
-from sfm_shapefit.adjustment.scale_bars import MOST_SIGMAS, BarFit
+from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.place_errors import Distances, ScaleErrors, draws_at, errors_of_points
+from sfm_shapefit.adjustment.scale_bars import MOST_SIGMAS, BarFit, pooled_noise
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded
-from sfm_shapefit.placement.control_points import TriangulatedMarks
+from sfm_shapefit.files.colmap.marks import look_at_marks
+from sfm_shapefit.placement.control_points import TriangulatedMarks, triangulate_marks
 from sfm_shapefit.scene.given import ScaleBars
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.tracks.structure_options import StructureOptions
 
 
 class ScaleBar(Record):
@@ -144,3 +148,26 @@ def describe_scale_bars(rows: Sequence[ScaleBar]) -> str:
             parts.append(f"{counted(len(own), noun)} off by {typical:.3g} (root mean square){most}")
     unused = sum(row.use == "unused" for row in rows)
     return "; ".join(parts + [f"{unused} not used"] * (unused > 0))
+
+
+def measure_bars(
+    images: Images, known: ScaleBars, estimate: Estimate | None, options: StructureOptions
+) -> MeasuredBars:
+    """Return scale bars as images have them where they stand, by what is known of the errors of these."""
+    marks = triangulate_marks(known, look_at_marks(images, known), options)
+    rows = np.flatnonzero(images.is_posed)
+    posed, used = images.part(rows), marks.agreeing
+    seen = known.points[used], np.searchsorted(rows, known.images[used])
+    noise_px = np.nan if estimate is None else estimate.noise_px
+    noise_px = pooled_noise(marks.errors_px[used], seen[0], noise_px)
+    ends = errors_of_points(posed, draws_at(estimate, posed), marks.positions, seen, noise_px)
+    return MeasuredBars(known, marks, ends.apart(known.ends))
+
+
+def compare_bars(
+    images: Images, known: ScaleBars, estimate: Estimate | None, scale_sigma: float | None
+) -> MeasuredBars:
+    """Return scale bars that only check a model, whose scale has an error, as far as that is known."""
+    found = measure_bars(images, known, estimate, StructureOptions())
+    count = found.found.draws.shape[2]
+    return found._replace(found=found.found.in_scale(ScaleErrors(np.zeros(count), scale_sigma or 0.0)))

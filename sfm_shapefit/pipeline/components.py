@@ -22,14 +22,16 @@ from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import UnposedImages, read_images
 from sfm_shapefit.files.colmap.database_pairs import refuse_no_features
+from sfm_shapefit.files.colmap.known import read_known
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
-from sfm_shapefit.pipeline.inputs import choose_intrinsics, inputs_from, read_left_out
-from sfm_shapefit.pipeline.known import between_images, read_known
+from sfm_shapefit.pipeline.inputs import inputs_from, read_left_out
+from sfm_shapefit.pipeline.intrinsics import choose_intrinsics
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
+from sfm_shapefit.placement.gauge_rule import between_images
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
 from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -77,7 +79,14 @@ def start_run(
         matches = DatabaseMatches(file, images.names)
         images, intrinsics = choose_intrinsics(images, matches, options.freedom.intrinsics, inputs.left_out)
         gauge = between_images(options.gauge, images.names, "the database has no image")
-        known = read_known(images, file, priors, options.gauge, options.averaging.gravity)
+        known = read_known(
+            images,
+            file,
+            priors,
+            control_points=gauge.control_points,
+            scale_bars=gauge.scale_bars,
+            gravity=options.averaging.gravity,
+        )
     return MapContext(
         options=replace(options, gauge=gauge),
         clock=clock,

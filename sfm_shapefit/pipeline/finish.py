@@ -8,16 +8,18 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, hand_back_memory
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, turned_deg
+from sfm_shapefit.facts.lengths import Axes, LengthFacts, length_between
 from sfm_shapefit.facts.located_warnings import located_warnings
+from sfm_shapefit.facts.placed import UNITS
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
 from sfm_shapefit.facts.warnings import rotation_suspicions, rotation_warnings
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.judgement.uncertainty import standard_deviations
-from sfm_shapefit.pipeline.lengths import usual_length
+from sfm_shapefit.pipeline.gauge_choice import scale_errors
 from sfm_shapefit.pipeline.state import ModelState
-from sfm_shapefit.placement.gauge import FEWEST_PRIORS, coincide
+from sfm_shapefit.placement.gauge import ARBITRARY, FEWEST_PRIORS, coincide
 from sfm_shapefit.placement.gauge_rule import SETS_SCALE
 from sfm_shapefit.placement.prior_fit import PriorFit, compare_with_priors
 
@@ -116,3 +118,14 @@ def _moved(given: FloatArray, placed: FloatArray) -> FloatArray | None:
         return None
     motion = fit_similarity_l1(given[common], placed[common])
     return np.asarray(np.linalg.norm(motion.apply(given) - placed, axis=1))
+
+
+def usual_length(state: ModelState) -> LengthFacts | None:
+    """Return how well a length between points of a finished model is known; None where it is not known."""
+    gauge = state.gauge
+    axes = Axes(
+        unit="m" if gauge.datum else UNITS[gauge.scale],
+        has_scale=gauge.scale not in ARBITRARY,
+        has_up=gauge.datum is not None or state.inputs.known.gravity is not None,
+    )
+    return length_between(state.images, state.points, state.estimate, scale_errors(state), axes)

@@ -8,12 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_shapefit.adjustment.place_errors import ScaleErrors, draws_at, errors_of_images
 from sfm_shapefit.adjustment.scale_bars import fit_scale_bars
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import Similarity, mean_rotation_l1
 from sfm_shapefit.facts.control_points import control_rows, control_warnings
+from sfm_shapefit.facts.scale_bars import measure_bars
 from sfm_shapefit.files.colmap.marks import look_at_marks
-from sfm_shapefit.pipeline.lengths import measure_bars, scale_errors
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.control_points import (
     control_gauge,
@@ -133,3 +134,22 @@ def _turn_upright(state: ModelState, gravity: Gravity) -> ModelState:
         return state
     statement = f"{state.gauge.statement}; z up by {int(np.sum(~wrong))} of {len(wrong)} gravities"
     return state.moved(turn_about_origin(turn), replace(state.gauge, axes=turn, statement=statement))
+
+
+def scale_errors(state: ModelState) -> ScaleErrors:
+    """Return the errors of a scale that the adjustment did not have: of bars, distances or control points."""
+    gauge, estimate = state.gauge, state.estimate
+    if state.bars is not None and state.bars.fit is not None:
+        return state.bars.fit.errors
+    count = estimate.num_draws if estimate else 0
+    draws, sigma = np.zeros(count), 0.0
+    if gauge.scale in ("control points", "distance"):
+        sigma = gauge.scale_sigma or 0.0
+    if gauge.scale == "distance" and count:
+        place_of = {name: k for k, name in enumerate(state.images.names)}
+        ends = np.array([[place_of[first], place_of[second]] for first, second, _ in state.inputs.distances])
+        known = errors_of_images(state.images, draws_at(estimate, state.images)).apart(ends)
+        shared = known.length_draws / known.lengths[:, None]
+        shared = shared[np.isfinite(shared).all(axis=1)]
+        draws = -shared.mean(axis=0) if len(shared) else draws
+    return ScaleErrors(draws, sigma)

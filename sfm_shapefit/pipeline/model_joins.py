@@ -25,16 +25,16 @@ from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.model import JoinedFacts
 from sfm_shapefit.facts.placed import UNITS, KeyFigures
 from sfm_shapefit.facts.result import Inputs, LocateResult
+from sfm_shapefit.facts.scale_bars import compare_bars
 from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.lengths import ARBITRARY, compare_bars
 from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
 from sfm_shapefit.pipeline.referee import check_source
-from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.gauge import ARBITRARY, Gauge
 from sfm_shapefit.placement.gauge_options import KnownDistance
 from sfm_shapefit.placement.gauge_rule import gauge_of_distances, resized_gauge
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces

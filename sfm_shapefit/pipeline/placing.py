@@ -6,8 +6,6 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
-
 from sfm_shapefit.base.arrays import hand_back_memory
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.clock import Clock
@@ -22,24 +20,10 @@ from sfm_shapefit.placement.place import InitialPlacement, Placement, place_piec
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.solver.solver_options import reported
-from sfm_shapefit.solver.tied import largest_tied
 from sfm_shapefit.tracks.structure_options import NodeOptions
 
 _FITTING = 0.95  # share of pairs that agree with a placement; from here on no other is tried
 _MOST_TRIED = 5_000  # nodes; more take seconds
-
-
-def rigs_statement(images: Images, measured: MeasuredGraph) -> str:
-    """Say how many frames there are, and how many of them the pairs tie to one another."""
-    groups, edges = measured.groups, measured.graph.edges
-    if groups is None:
-        return "none: every image is a frame of its own"
-    frames = f"{len(images.frames.ids)} frames of {images.num_images} images"
-    if not measured.has_scale:
-        return f"{frames}; no pair sees two cameras of a frame that are apart, so their scale is open"
-    sizes = measured.cameras_per_group
-    tied = int(np.sum(sizes[largest_tied(edges, groups, sizes)] > 0))
-    return f"{frames}, of which the pairs tie {tied} in metric scale; the pieces below take images one by one"
 
 
 def place_cameras(

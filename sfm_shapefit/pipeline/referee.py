@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit import __version__
-from sfm_shapefit.adjustment.sources import collect_tracks
+from sfm_shapefit.adjustment.sources import collect_matches, collect_tracks
+from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.display import Reported
@@ -57,9 +58,11 @@ from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
-from sfm_shapefit.pipeline.pictures import points_of_pictures
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.matches import is_among
 from sfm_shapefit.scene.structure import Structure
+from sfm_shapefit.tracks.filter import filter_points
+from sfm_shapefit.tracks.structure_options import StructureOptions
 
 if TYPE_CHECKING:
     import pycolmap
@@ -368,3 +371,14 @@ def _none_agrees(fits: PairFits, source: MatchSource) -> Iterator[Reason]:
 
 def _median(values: list[float]) -> float:
     return float(np.median(values)) if values else np.nan
+
+
+def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:
+    """Return the points that matches make where the cameras stand, but for those of contradicting pairs."""
+    images, view = source.images, source.view
+    pictures = ModelKeypoints(images, view.keypoints, view.num_keypoints)
+    links = view.links(chosen=~is_among(view.pairs, fits.sides[1]))
+    matches = collect_matches(images, pictures, np.arange(images.num_images), links, view.num_matches)
+    options = StructureOptions()
+    points = triangulate(images, matches, options)
+    return Structure(filter_points(points, images, pictures, options), images, pictures)

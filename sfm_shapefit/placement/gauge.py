@@ -26,6 +26,8 @@ from sfm_shapefit.base.geometry import (
 from sfm_shapefit.placement.prior_readings import better_reading
 from sfm_shapefit.scene.given import EarthDatum, PositionPriors
 
+ARBITRARY = ("input", "unit")
+"""Kinds of scale that give way to known lengths."""
 _CAP_OF_SIZE = 0.5  # spreads of all input centers; one that is farther off is lost and must not set the scale
 _ROUGH = 0.1  # spreads; the scale is rough if the input's centers are off by more, in the median
 _DOUBTFUL = 0.01  # spreads; priors that are off by more are tried in other readings

@@ -25,9 +25,10 @@ from sfm_shapefit.placement.gauge import (
     prior_gauge,
     unit_gauge,
 )
-from sfm_shapefit.placement.gauge_options import KnownDistance, Scale
+from sfm_shapefit.placement.gauge_options import GaugeOptions, KnownDistance, Scale
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import names_among
 
 SETS_SCALE: dict[ScaleKind, str] = {
     "fixed": "the fixed cameras",
@@ -170,3 +171,17 @@ def say_unused(what: str, chosen: Gauge, find: Callable[[], float]) -> str:
         return f"{unused}; they differ by {100.0 * abs(find() - 1.0):.3g} %"
     except (InputError, UnsolvableError) as error:
         return f"{unused}, and do not check it: {error}"
+
+
+def between_images(gauge: GaugeOptions, names: Sequence[str], missing: str) -> GaugeOptions:
+    """Return options whose known distances are between images of some names.
+
+    Raises:
+        InputError: if one is of an image that there is not; `missing` says so, but for its name.
+    """
+    named, ambiguity = names_among((name for one in gauge.known_distance for name in one[:2]), names)
+    for name in (name for one in gauge.known_distance for name in one[:2]):
+        if name not in named:
+            raise InputError(f"known distances: {missing} {name}{ambiguity and f'; {ambiguity}'}")
+    known = tuple((named[first], named[second], length) for first, second, length in gauge.known_distance)
+    return replace(gauge, known_distance=known)

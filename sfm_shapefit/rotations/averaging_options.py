@@ -9,9 +9,6 @@ from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 Sequencing = Literal["auto", "names", "none"]
 """Which images are taken for videos: those whose matches say so too, all whose names do, or none."""
 
-GRAVITY_OF_DATABASE = "database"
-"""In place of a file: the gravity of the database's pose priors."""
-
 
 @explained
 @dataclass(frozen=True, kw_only=True)

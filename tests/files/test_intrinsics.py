@@ -11,7 +11,7 @@ from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.intrinsics import calibrate_view_graph, find_uncalibrated
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.pipeline.inputs import choose_intrinsics
+from sfm_shapefit.pipeline.intrinsics import choose_intrinsics
 from sfm_shapefit.scene.lens import FOCAL, Origin
 from tests.scenes import RING, copied, edit_database, fingerprint, read_from
 

@@ -10,7 +10,7 @@ import sfm_shapefit
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.pair_focals import read_pair_focals
-from sfm_shapefit.pipeline import inputs
+from sfm_shapefit.pipeline import intrinsics
 from tests.lens_scene import camera_of_model, write_scene
 from tests.scenes import edit_database, read_from
 
@@ -79,10 +79,10 @@ def test_they_outweigh_the_view_graph_where_they_differ_from_it_by_more_than_the
     with_lenses_of_pairs(scene[0], lambda _: 500.0)
     asked = {2: 600.0, 4: 510.0}  # of camera 6 the view graph says nothing
     monkeypatch.setattr(
-        inputs, "calibrate_view_graph", lambda *_: {i: px / GUESS_PX for i, px in asked.items()}
+        intrinsics, "calibrate_view_graph", lambda *_: {i: px / GUESS_PX for i, px in asked.items()}
     )
     given = read_from(scene[0], read_images).images
     with closing(open_database(scene[0], given.names)) as matches:
-        images, _ = inputs.choose_intrinsics(given, matches, "auto")
+        images, _ = intrinsics.choose_intrinsics(given, matches, "auto")
     found = [lens.focal_px for lens in images.lenses if lens.id in GUESSED]
     assert found == pytest.approx([500.0, 510.0, 500.0])

@@ -14,7 +14,6 @@ from sfm_shapefit.judgement.image_quality import find_weak_images
 from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.judgement.reasons import Grade, Kind, of_each
 from sfm_shapefit.pairs.direction_options import DirectionOptions
-from sfm_shapefit.pipeline.pictures import points_of_pictures
 from sfm_shapefit.pipeline.referee import (
     CheckState,
     OtherModel,
@@ -23,6 +22,7 @@ from sfm_shapefit.pipeline.referee import (
     fit_directions,
     gather_evidence_against,
     grade_model,
+    points_of_pictures,
     read_structure,
 )
 from tests.judgement.made import opinion_with

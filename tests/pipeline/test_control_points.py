@@ -10,11 +10,10 @@ import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.files.colmap.control_points import read_control_points
+from sfm_shapefit.files.colmap.known import read_known
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.pipeline.known import read_known
 from sfm_shapefit.placement.control_points import control_gauge, fit_control_points
 from sfm_shapefit.placement.gauge import Gauge
-from sfm_shapefit.placement.gauge_options import GaugeOptions
 from sfm_shapefit.scene.given import ControlPoints
 from tests.models import write_priors
 from tests.scenes import RING
@@ -202,7 +201,7 @@ TWICE = [line(k, image) for k in range(4) for image in ("0001.jpg", "0002.jpg")]
 def test_a_file_that_cannot_serve_is_refused(ring, tmp_path, projection, lines, said):
     path = written(tmp_path, lines, projection)
     with pytest.raises(InputError, match=path.replace(".", r"\.")) as refused:
-        read_known(read_model(ring).images, None, gauge=GaugeOptions(control_points=path))
+        read_known(read_model(ring).images, None, control_points=path)
     assert said in str(refused.value)
 
 

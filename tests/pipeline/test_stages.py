@@ -19,6 +19,7 @@ from sfm_shapefit.base.geometry import (
     rotation_angles_deg,
     turned_deg,
 )
+from sfm_shapefit.facts.command_options import pull_of_rotations
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -30,7 +31,6 @@ from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.camera_adjustment import adjust_placed
 from sfm_shapefit.pipeline.doubts import doubt_cameras
 from sfm_shapefit.pipeline.finish import finish_model
-from sfm_shapefit.pipeline.known import pull_of_rotations
 from sfm_shapefit.pipeline.measure import MeasureRequest, add_evidence, build_graph, measure
 from sfm_shapefit.pipeline.model_joins import judge_joins, merge_groups
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces

@@ -66,10 +66,11 @@ def quiet_stderr() -> Iterator[None]:
         yield
         return
     nowhere, before = os.open(os.devnull, os.O_WRONLY), sys.stderr
+    is_own = before is sys.__stderr__  # and nobody's who listens to Python
     try:
         _flush_stderr()
         os.dup2(nowhere, 2)
-        if before is not None and before is sys.__stderr__:
+        if before is not None and is_own:
             how: Any = {"buffering": 1, "encoding": before.encoding, "errors": before.errors}
             sys.stderr = os.fdopen(saved, "w", closefd=False, **how)
         yield

@@ -13,8 +13,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from sfm_shapefit.adjustment.sources import collect_matches
-from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.paths import refuse_no_folder
@@ -22,15 +20,8 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.picture_matches import PictureMatches, read_descriptors
-from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, Shared, choose_pairs
-from sfm_shapefit.judgement.pair_fits import PairFits
-from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.scene.matches import is_among
-from sfm_shapefit.scene.structure import Structure
-from sfm_shapefit.tracks.filter import filter_points
-from sfm_shapefit.tracks.structure_options import StructureOptions
 
 _FOR_FEATURES = 0.6  # share of the minutes; features take half of the time where there is no limit
 _WHY_ASKED = {
@@ -104,14 +95,3 @@ def _state(folder: Path, states: Sequence[str], reasons: Sequence[str], count: i
 def _whys(whys: Sequence[str]) -> str:
     """Say how often each reason is given, but for that of pictures which were asked."""
     return ", ".join(f"{num:,} {why}" for why, num in Counter(whys).items() if why != "asked")
-
-
-def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:
-    """Return the points that matches make where the cameras stand, but for those of contradicting pairs."""
-    images, view = source.images, source.view
-    pictures = ModelKeypoints(images, view.keypoints, view.num_keypoints)
-    links = view.links(chosen=~is_among(view.pairs, fits.sides[1]))
-    matches = collect_matches(images, pictures, np.arange(images.num_images), links, view.num_matches)
-    options = StructureOptions()
-    points = triangulate(images, matches, options)
-    return Structure(filter_points(points, images, pictures, options), images, pictures)

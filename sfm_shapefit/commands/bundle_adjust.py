@@ -9,27 +9,18 @@ import numpy as np
 
 from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.covariance import FrameCovariances, estimate_covariances
-from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
+from sfm_shapefit.adjustment.freedom import GivenPoses
 from sfm_shapefit.adjustment.given_rotations import noise_px_of
 from sfm_shapefit.adjustment.lengths import estimate_lengths
 from sfm_shapefit.adjustment.problem import RotationPrior, isotropic_information
-from sfm_shapefit.adjustment.run import begin, solve_known_points
 from sfm_shapefit.adjustment.solve import Adjusted, adjust
-from sfm_shapefit.adjustment.sources import collect_tracks
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.executors import Crew
 from sfm_shapefit.base.settings import merge_options
-from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import ModelSource, read_model
-from sfm_shapefit.files.colmap.model_arrays import ModelArrays
-from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
-from sfm_shapefit.files.colmap.reconstructions import arrays_of, moved_reconstruction
-from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.points import Points
-from sfm_shapefit.tracks.links import ObservedTracks
-from sfm_shapefit.tracks.structure_options import StructureOptions
+from sfm_shapefit.files.colmap.reconstructions import moved_reconstruction
+from sfm_shapefit.pipeline.bundle import read_bundle
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 
 _WITHIN_95 = 1.96  # standard deviations; between them on either side lie 95 % of a normal distribution
@@ -164,30 +155,4 @@ def bundle_adjust(
         options=options,
         cameras={images.names[k]: int(np.searchsorted(views.images, k)) for k in range(len(images.names))},
         points=dict(zip(points.ids.tolist(), range(points.num_points), strict=True)),
-    )
-
-
-def adjust_joined(reconstruction: "pycolmap.Reconstruction", threads: int) -> "pycolmap.Reconstruction":
-    """Return a model whose parts were joined, poses and points of all adjusted together.
-
-    The scale of the loss is the one that the errors call for, as in the adjustments of `locate`: photographs
-    that were adjusted with a finer one than the default of `bundle_adjust` would get worse by that.
-    """
-    read, _ = arrays_of(reconstruction)
-    images, points, tracks = read_bundle(read)
-    run = begin(images, tracks, StructureOptions(), Freedom(), crew=Crew(threads))
-    run, last = solve_known_points(run, points.xyz)
-    return moved_reconstruction(read, run.images, replace(points, xyz=last.points))
-
-
-def read_bundle(model: ModelArrays) -> tuple[Images, Points, ObservedTracks]:
-    """Return the posed images of a model in the order of their ids, its points, and the tracks of these."""
-    every = images_of(model)
-    images = every.part(np.flatnonzero(every.is_posed))
-    images = images.part(np.argsort(images.ids))
-    points = points_of(model, images)
-    return (
-        images,
-        points,
-        collect_tracks(images, ModelKeypoints(images, points2d_of(model, images)), points),
     )

@@ -1,44 +1,36 @@
 """Read what the user knows of images beside their matches: positions, distances, gravity, who stays."""
 
-import math
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.command_options import FIX_SOLVED, Rotations
+from sfm_shapefit.base.paths import OF_DATABASE, SOLVED
 from sfm_shapefit.files.colmap.control_points import read_control_points
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.scale_bars import read_scale_bars
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.lines import text_of
-from sfm_shapefit.placement.gauge_options import GaugeOptions
-from sfm_shapefit.rotations.averaging_options import GRAVITY_OF_DATABASE
 from sfm_shapefit.scene.given import ControlPoints, Gravity, Known, PositionPriors
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.same_images import names_among, same_images
-
-NO_GAUGE = GaugeOptions()
-
-PRIORS_OF_DATABASE = "database"
-"""In place of a table or folder: the database's own pose priors."""
+from sfm_shapefit.scene.same_images import same_images
 
 
 def read_known(
     images: Images,
     file: DatabaseFile | None,
     priors: Path | str | None = None,
-    gauge: GaugeOptions = NO_GAUGE,
+    *,
+    control_points: str = "",
+    scale_bars: str = "",
     gravity: str = "",
 ) -> Known:
-    """Return what the user tells of images: priors, points, bars and gravity, as far as asked for."""
+    """Return what files tell of images: priors, points, bars and gravity, as far as asked for."""
     return Known(
         priors=None if priors is None else _read_priors(images, file, priors),
-        control=_read_control(images, gauge.control_points) if gauge.control_points else None,
-        bars=read_scale_bars(Path(gauge.scale_bars), images) if gauge.scale_bars else None,
+        control=_read_control(images, control_points) if control_points else None,
+        bars=read_scale_bars(Path(scale_bars), images) if scale_bars else None,
         gravity=_read_gravity(images, file, gravity) if gravity else None,
     )
 
@@ -46,7 +38,7 @@ def read_known(
 def _read_priors(images: Images, file: DatabaseFile | None, source: Path | str) -> PositionPriors:
     from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors  # few are given
 
-    if str(source) == PRIORS_OF_DATABASE:
+    if str(source) == OF_DATABASE:
         if file is None:
             raise InputError("there is no database whose priors could be taken; give one (database=FILE)")
         return database_priors(file, images)
@@ -63,43 +55,22 @@ def _read_control(images: Images, file: str) -> ControlPoints:
 def _read_gravity(images: Images, file: DatabaseFile | None, source: str) -> Gravity:
     from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity  # few are given
 
-    if source != GRAVITY_OF_DATABASE:
+    if source != OF_DATABASE:
         return table_gravity(Path(source), images)
     if file is None:
         raise InputError("there is no database whose gravity could be taken; give a table")
     return database_gravity(file, images)
 
 
-def between_images(gauge: GaugeOptions, names: Sequence[str], missing: str) -> GaugeOptions:
-    """Return options whose known distances are between images of some names.
-
-    Raises:
-        InputError: if one is of an image that there is not; `missing` says so, but for its name.
-    """
-    named, ambiguity = names_among((name for one in gauge.known_distance for name in one[:2]), names)
-    for name in (name for one in gauge.known_distance for name in one[:2]):
-        if name not in named:
-            raise InputError(f"known distances: {missing} {name}{ambiguity and f'; {ambiguity}'}")
-    known = tuple((named[first], named[second], length) for first, second, length in gauge.known_distance)
-    return replace(gauge, known_distance=known)
-
-
-def pull_of_rotations(rotations: Rotations) -> float | None:
-    """Return by which standard deviation given rotations pull, see `Freedom`; None: as the matches say."""
-    if not isinstance(rotations, str):
-        return math.radians(rotations)
-    return {"auto": None, "held": 0.0, "free": math.inf}[rotations]
-
-
 def read_fixed_images(model: ColmapModel, fix: str) -> BoolArray:
-    """Return which images (n,) are to stay where they are.
+    """Return which images (n,) are to stay where they are: of a file of names, or those that see points.
 
     Raises:
         InputError: if the file of their names cannot be read, a name is unknown, or nothing is left to place.
     """
     if not fix:
         return np.zeros(model.images.num_images, dtype=np.bool_)
-    fixed = _solved_images(model) if fix == FIX_SOLVED else _named_images(model, Path(fix))
+    fixed = _solved_images(model) if fix == SOLVED else _named_images(model, Path(fix))
     if not model.images.is_posed[fixed].all():
         raise InputError("the position of a fixed camera is not known (NaN); fix others, whose position is")
     if fixed.all():
