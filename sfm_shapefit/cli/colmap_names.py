@@ -116,7 +116,7 @@ def answer_for_command(name: str, following: str = "") -> str | None:
         return answer_for_command(following) or f"{name} is another program; {ours}"
     for names, where in (
         (_BEFORE, "run it on the database before sfm-shapefit map DATABASE OUT"),
-        (_AFTER, "run it on a model that sfm-shapefit wrote"),
+        (_AFTER, "run it on a model that map or locate wrote"),
         (_DENSE, f"run it on the folder of sfm-shapefit {_COMMANDS['image_undistorter']}"),
     ):
         if name in names:
@@ -145,13 +145,15 @@ def answer_for_file(names: Iterable[str], known: Set[str]) -> str | None:
     The command has the `known` flags and keys of a file.
     """
     names = list(names)
-    here = {name: _counterpart(name, known) for name in names}
     if not any(_is_colmaps(name) for name in names):
         return None
+    others = [name for name in names if not name.endswith("_path")]
+    here = {name: _counterpart(name, known) for name in others}
     told = [f"{name} is {ours.removesuffix(_OF_CONFIG)} here" for name, ours in here.items() if ours]
-    others = len(names) - len(told)
-    rest = [f"{counted(others, 'option')} can be left out"] if others else []
-    return f"has options of COLMAP, which are not read: {'; '.join([*told, *rest])}"
+    told += ["paths are arguments here"] if len(others) < len(names) else []
+    useless = sum(ours is None for ours in here.values())
+    told += [f"{counted(useless, 'option')} can be left out"] if useless else []
+    return f"has options of COLMAP, which are not read: {'; '.join(told)}"
 
 
 def _is_colmaps(option: str) -> bool:

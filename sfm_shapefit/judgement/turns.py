@@ -136,7 +136,7 @@ class Doubts:
     def known_to(self, sigma_rad: float) -> "Doubts":
         """Return the same where rotations are known to that standard deviation about each axis.
 
-        Of two rotations that pairs speak for, the given one is right where the other is far beyond it.
+        Where pairs speak for two rotations, the given one is right if the other is far beyond that.
         """
         return self.without(self.ambiguous & (np.radians(self.angles_deg) > _FAR * sigma_rad))
 
