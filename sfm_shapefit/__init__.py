@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.commands.workspace import workspace as workspace
     from sfm_shapefit.commands.write import WriteOptions as WriteOptions
     from sfm_shapefit.commands.write import write_result as write_result
+    from sfm_shapefit.facts.check_result import CheckResult as CheckResult
     from sfm_shapefit.facts.command_options import InspectOptions as InspectOptions
     from sfm_shapefit.facts.command_options import JoinOptions as JoinOptions
     from sfm_shapefit.facts.command_options import LocateOptions as LocateOptions
@@ -65,7 +66,6 @@ if TYPE_CHECKING:
     from sfm_shapefit.graph.viewgraph import ViewGraph as ViewGraph
     from sfm_shapefit.judgement.trust_options import TrustOptions as TrustOptions
     from sfm_shapefit.pairs.direction_options import DirectionOptions as DirectionOptions
-    from sfm_shapefit.pipeline.referee import CheckResult as CheckResult
     from sfm_shapefit.placement.gauge_options import GaugeOptions as GaugeOptions
     from sfm_shapefit.placement.place import Placement as Placement
     from sfm_shapefit.refinement.placement_options import PlacementOptions as PlacementOptions
@@ -89,7 +89,7 @@ _HOMES = {
     "adjustment.adjustment_options": ("AdjustmentOptions",),
     "commands.bundle_adjust": ("AdjustedModel", "bundle_adjust"),
     "commands.check": ("check", "check_pieces"),
-    "pipeline.referee": ("CheckResult",),
+    "facts.check_result": ("CheckResult",),
     "commands.convert": ("convert",),
     "commands.drop_in": ("average_database", "global_mapping"),
     "commands.evaluate": ("evaluate",),

@@ -28,7 +28,7 @@ from sfm_shapefit.adjustment.priors import add_priors
 from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
 from sfm_shapefit.adjustment.residuals import NormalEquations, Values, linearize
 from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points, invert_points, step_points
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from sfm_shapefit.base.executors import Crew
 from sfm_shapefit.laplacian.operators import Workers, group_by
 
@@ -50,7 +50,7 @@ class _Share(NamedTuple):
 
     points: IntArray
     frames: IntArray
-    cameras: IntArray
+    cameras: IndexArray
     lenses: IntArray
     nodes: IntArray
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, frozen
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray, distinct, frozen
 from sfm_shapefit.base.geometry import normalized, tangent_bases
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import Workers, group_by
@@ -53,19 +53,17 @@ class Layout:
     held_of_lens: FloatArray
     """(l, 9) the other numbers of each lens, which never change."""
 
-    observation: IntArray
-    """(m,) the order by points: row of the problem's observations that stands k-th here."""
     first_observation: IntArray
     """(k + 1,) first observation of each point."""
-    camera: IntArray
+    camera: IndexArray
     """(m,) camera of each observation."""
     pixels: FloatArray
     """(m, 2)"""
-    frame_entry: IntArray
+    frame_entry: IndexArray
     """(m,) entry of the observation's frame, or -1."""
-    lens_entry: IntArray
+    lens_entry: IndexArray
     """(m,) entry of its lens, or -1."""
-    sensor_entry: IntArray
+    sensor_entry: IndexArray
     """(m,) entry of its sensor, or -1."""
 
     frame_of_camera: IntArray
@@ -81,13 +79,13 @@ class Layout:
 
     first_entry: IntArray
     """(k + 1,) first entry of each point."""
-    entry_node: IntArray
+    entry_node: IndexArray
     """(E,)"""
-    entry_point: IntArray
+    entry_point: IndexArray
     """(E,)"""
     first_of_node: IntArray
     """(N + 1,) into `entries_by_node`."""
-    entries_by_node: IntArray
+    entries_by_node: IndexArray
     """(E,)"""
     first_pair: IntArray
     """(N + 1,) the pairs whose first node is i."""
@@ -139,7 +137,6 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions, nodes: Nodes
     numbers = number_nodes(problem, options) if nodes is None else nodes
     node_of_frame, node_of_lens, node_of_sensor, active = numbers[:4]
     point, camera, pixels = problem.points_seen, problem.cameras_seeing, problem.pixels
-    order = np.arange(len(point))
     if (point[1:] < point[:-1]).any():  # else the arrays are shared, since all of them are large
         order = np.argsort(point, kind="stable")
         point, camera, pixels = point[order], camera[order], np.ascontiguousarray(pixels[order])
@@ -149,10 +146,10 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions, nodes: Nodes
     sensor_node = np.append(node_of_sensor, -1)[sensor_of_camera]
     seeing = np.stack([frame_node, lens_node, sensor_node])
     workers = Workers(options.threads)
-    where = np.full((3, len(camera)), -1)  # as it stays where there is no entry
+    where = np.full((3, len(camera)), -1, dtype=np.int32)  # as it stays where there is no entry
     enter = partial(_enter, first_observation, camera, seeing, where)
     first_entry, entry_node = _list(enter, first_observation, workers)
-    entry_point = np.repeat(np.arange(problem.num_points), np.diff(first_entry))
+    entry_point = np.repeat(np.arange(problem.num_points, dtype=np.int32), np.diff(first_entry))
     first_of_node, by_node = group_by(frozen(entry_node), len(active))
     meet = partial(_meet, first_of_node, by_node, entry_point, entry_node, first_entry)
     first_pair, seconds = _list(meet, first_of_node, workers)
@@ -163,7 +160,6 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions, nodes: Nodes
     return Layout(
         **numbers._asdict(),
         held_of_lens=held_of(problem.lenses),
-        observation=order,
         first_observation=first_observation,
         camera=camera,
         pixels=pixels,
@@ -179,7 +175,7 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions, nodes: Nodes
         entry_node=entry_node,
         entry_point=entry_point,
         first_of_node=first_of_node,
-        entries_by_node=by_node,
+        entries_by_node=by_node.astype(np.int32),
         first_pair=first_pair,
         pairs=pairs,
         turns=not options.hold_rotations,
@@ -256,7 +252,7 @@ def _pack(problem: AdjustmentProblem, sizes: IntArray) -> tuple[IntArray, IntArr
     row_of = np.full(len(sizes), -1)
     row_of[small] = np.arange(len(small))
     rows = row_of[problem.lens_of_camera[problem.cameras_seeing]]
-    seen = distinct(rows[rows >= 0] * problem.num_points + problem.points_seen[rows >= 0])
+    seen = distinct(rows[rows >= 0] * problem.num_points + problem.points_seen[rows >= 0].astype(np.int64))
     of_rows = (np.ones(len(seen), np.int32), np.divmod(seen, max(problem.num_points, 1)))
     sees = coo_array(of_rows, shape=(len(small), problem.num_points)).tocsr()
     shared, num_packs = sees @ sees.T, 0
@@ -276,7 +272,7 @@ def _pack(problem: AdjustmentProblem, sizes: IntArray) -> tuple[IntArray, IntArr
     return packs, first_slots
 
 
-def _links(nodes: IntArray, camera: IntArray) -> tuple[IntArray, IntArray]:
+def _links(nodes: IntArray, camera: IndexArray) -> tuple[IntArray, IntArray]:
     """Return the nodes that an observation ties, and the places of each camera's three ties (3, c), or -1.
 
     The nodes (3, c) are those of each camera's frame, lens and sensor, `camera` that of each observation.
@@ -291,16 +287,16 @@ def _links(nodes: IntArray, camera: IntArray) -> tuple[IntArray, IntArray]:
     return links, links_of_camera
 
 
-def _list(write: Callable[..., None], starts: IntArray, workers: Workers) -> tuple[IntArray, IntArray]:
+def _list(write: Callable[..., None], starts: IntArray, workers: Workers) -> tuple[IntArray, IndexArray]:
     """Return what a kernel lists for each row, as where the lists begin (n + 1,) and all items.
 
     Called with `first` and `out`, it counts the items of row i into first[i + 1], or writes them if `out` has
     room. Rows are shared out by `starts`, see `Workers.share`.
     """
-    first, out = np.zeros(len(starts), np.int64), np.empty(0, np.int64)
+    first, out = np.zeros(len(starts), np.int64), np.empty(0, np.int32)
     workers.share(starts, partial(write, first, out), _WORTH_A_THREAD)
     np.cumsum(first, out=first)
-    out = np.empty(int(first[-1]), np.int64)
+    out = np.empty(int(first[-1]), np.int32)
     workers.share(starts, partial(write, first, out), _WORTH_A_THREAD)
     return first, out
 

@@ -23,11 +23,12 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.lens import NUM_VALUES, Lens
 
+_OBSERVED = ("cameras_seeing", "points_seen")
 _ORTHONORMAL = 1e-6  # largest entry of R R^T - I; six printed digits leave less
 
 
@@ -113,9 +114,9 @@ class AdjustmentProblem:
     """(n, 3) the origin of each frame in the world."""
     points: FloatArray
     """(k, 3)"""
-    cameras_seeing: IntArray
+    cameras_seeing: IndexArray
     """(m,) the camera of each observation."""
-    points_seen: IntArray
+    points_seen: IndexArray
     """(m,) the point of each observation."""
     pixels: FloatArray
     """(m, 2) where it was seen."""
@@ -147,8 +148,9 @@ class AdjustmentProblem:
         self._take("pixels", np.float64, (len(self.pixels), 2))
         self._take("lens_of_camera", np.int64, (len(self.lens_of_camera),))
         self._take("fixed", np.bool_, (n,))
-        for name in ("cameras_seeing", "points_seen"):
-            self._take(name, np.int64, (len(self.pixels),))
+        for name in _OBSERVED:
+            kept = np.int32 if np.asarray(getattr(self, name)).dtype == np.int32 else np.int64
+            self._take(name, kept, (len(self.pixels),))
         _check_rotations(self.rotations, "rotation")
         for lens in self.lenses:
             lens.refuse_impossible()
@@ -156,6 +158,8 @@ class AdjustmentProblem:
         _check_range(self.lens_of_camera, len(self.lenses), "lens")
         self._check_rig()
         _check_range(self.cameras_seeing, self.num_cameras, "camera")
+        for name in _OBSERVED:  # as there are very many, and in range
+            object.__setattr__(self, name, getattr(self, name).astype(np.int32, copy=False))
         self._check_priors()
 
     @property
@@ -245,7 +249,7 @@ class AdjustmentProblem:
                 )
 
 
-def _check_range(indices: IntArray, size: int, what: str) -> None:
+def _check_range(indices: IndexArray, size: int, what: str) -> None:
     if indices.size and (indices.min() < 0 or indices.max() >= size):
         raise InputError(f"a {what} index leaves 0..{size - 1}")
 

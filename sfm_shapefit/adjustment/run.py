@@ -181,7 +181,7 @@ class AdjustmentRun:
         images = views_of(self.images).images[thin.cameras]
         chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, self.images.num_images, times)
         del images
-        place = np.full(len(found.points), -1)
+        place = np.full(len(found.points), -1, dtype=np.int32)
         place[chosen] = np.arange(len(chosen))
         points = found.points[chosen]
         seen = thin.spread(place)  # rather than a copy of the tracks that are chosen, which is large

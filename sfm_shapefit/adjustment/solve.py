@@ -42,7 +42,7 @@ _NEAR = 1e-2  # relative fall of the cost by a step; after less the minimum is n
 _LEAST_CURVATURE = 0.3
 # Steps of each point by itself before the first joint step; 20 steps save no joint step on real scenes.
 _FIRST_SETTLING = 8
-_MANY_ENTRIES = 4_000_000  # entries, 0.6 GB; more are given up while the system is factored, and made anew
+MANY_ENTRIES = 4_000_000  # entries, 0.6 GB; more are given up while the system is factored, and made anew
 _STATIONARY = 1e-6  # gradient norm; at less, steps that rounding refuses mean a minimum
 _EXACT_PX = 1e-10  # rms residual in pixels; less is rounding
 _LEAST_LEFT = 0.25  # share of the squares that a point leaves of its errors; that of two observations
@@ -346,7 +346,7 @@ class _Run:
     def propose(self, damping: float) -> tuple[Values, float, float] | None:
         """Return the values after a damped step, the decrease predicted, and the cost; None without one."""
         layout, normal = self.layout, self.normal
-        is_large = len(normal.entries) > _MANY_ENTRIES
+        is_large = len(normal.entries) > MANY_ENTRIES
         system = eliminate_points(layout, normal, damping, self.workers)
         if is_large:
             normal.entries = normal.entries[:0].copy()

@@ -86,9 +86,9 @@ def collect_tracks(images: Images, pictures: KeypointRays, points: Points) -> Ob
     back = np.argsort(points.points_seen()[order], kind="stable")
     return ObservedTracks(
         offsets=points.offsets,
-        cameras=cameras[back].astype(np.int64),
+        cameras=cameras[back],
         keypoints=points.keypoints[order][back],
-        pixels=pixels[back].astype(np.float64),
+        pixels=pixels[back],
         on_plane=on_plane[back],
         ids=points.ids,
         may_split=False,

@@ -58,7 +58,7 @@ class Views:
 
         Lenses among `sensors` (l,) move in their rigs. Rotations that were given have no part yet.
         """
-        used = np.flatnonzero(found.points_seen >= 0)
+        used = found.points_seen >= 0
         rotations, translations = self._as_adjusted(images)._sensors(images)
         frames, lenses = images.frame_of[self.images], images.lens_of[self.images]
         rig = Rig(
@@ -73,7 +73,7 @@ class Views:
             points=found.points,
             cameras_seeing=tracks.cameras[used],
             points_seen=found.points_seen[used],
-            pixels=tracks.pixels[used],
+            pixels=tracks.pixels[used].astype(np.float64),
             lenses=tuple(map(_lens_of_views, images.lenses)),
             lens_of_camera=lenses,
             rig=rig,
@@ -107,7 +107,7 @@ class Views:
             xyz=found.points,
             offsets=offsets_of(lengths),
             images=self.images[tracks.cameras[used]],
-            keypoints=tracks.keypoints[used],
+            keypoints=tracks.keypoints[used].astype(np.int64),
             ids=1 + np.arange(len(lengths)) if tracks.may_split else tracks.ids[found.tracks],
         )
 

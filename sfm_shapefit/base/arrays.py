@@ -84,6 +84,8 @@ def _resident_bytes() -> int:
 Int32Array = npt.NDArray[np.int32]
 UInt32Array = npt.NDArray[np.uint32]
 UInt64Array = npt.NDArray[np.uint64]
+IndexArray = npt.NDArray[np.integer]
+"""Indices, of 32 bits where there are very many."""
 
 
 def rank_within(labels: IntArray, *keys: IntArray) -> IntArray:

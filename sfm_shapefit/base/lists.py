@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import AnyArray, IntArray
+from sfm_shapefit.base.arrays import AnyArray, IndexArray, IntArray
 
 
 def offsets_of(lengths: npt.ArrayLike) -> IntArray:
@@ -63,7 +63,7 @@ class RowLists(Lists):
     """(m,)"""
 
     @classmethod
-    def by_label(cls, labels: IntArray, count: int = 0) -> "RowLists":
+    def by_label(cls, labels: IndexArray, count: int = 0) -> "RowLists":
         """Return a list for each of `count` labels or more, of the rows (m,) that have it, ascending.
 
         Rows whose label is negative are in none.

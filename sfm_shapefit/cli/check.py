@@ -34,8 +34,8 @@ from sfm_shapefit.cli.progress import show_progress
 from sfm_shapefit.cli.root import app
 
 if TYPE_CHECKING:
+    from sfm_shapefit.facts.check_result import CheckResult
     from sfm_shapefit.facts.checked_pieces import CheckedPieces
-    from sfm_shapefit.pipeline.referee import CheckResult
 
 
 @app.command(
@@ -105,9 +105,9 @@ def check_command(
         from sfm_shapefit.base.atomic_folder import claimed_output
         from sfm_shapefit.commands.check import check
         from sfm_shapefit.commands.lengths import judge_bars
-        from sfm_shapefit.commands.write import refuse_file
         from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
+        from sfm_shapefit.files.output_paths import refuse_file
         from sfm_shapefit.pipeline.inputs import choose_inputs
 
         known = choose_inputs(source, database).database

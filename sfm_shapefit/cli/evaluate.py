@@ -95,8 +95,8 @@ def evaluate_command(
         from sfm_shapefit.base.atomic_folder import atomic_file
         from sfm_shapefit.base.paths import refuse_absent
         from sfm_shapefit.commands.evaluate import evaluate, evaluate_against_table
-        from sfm_shapefit.commands.write import refuse_file
         from sfm_shapefit.facts.tables import write_records
+        from sfm_shapefit.files.output_paths import refuse_file
 
         if csv is not None:
             refuse_absent(source, truth)

@@ -76,7 +76,7 @@ class Run(Generic[S]):
 
     def _tell(self, found: "Result", source: Path, out: Path) -> None:
         """Print the details if they are wanted, the answer, the verdict, and what to do next."""
-        from sfm_shapefit.commands.write import has_colors
+        from sfm_shapefit.commands.colors import has_colors
 
         told, pages = found.told, [str(out / folder / "report.html") for folder in found.told.folders]
         if self.flags.verbose:

@@ -133,12 +133,12 @@ def write_converted(
     """Write a model in another format, in a system and with an offset; `convert` raises the same."""
     # Here, so that the command line knows the formats without loading pycolmap.
     from sfm_shapefit.base.paths import refuse_absent
-    from sfm_shapefit.commands.write import refuse_file
     from sfm_shapefit.facts.tables import model_datum
     from sfm_shapefit.files.colmap.listed_poses import read_by_itself
     from sfm_shapefit.files.colmap.model import model_of, read_model
     from sfm_shapefit.files.colmap.reconstructions import transform_model
     from sfm_shapefit.files.colmap.world import world_of
+    from sfm_shapefit.files.output_paths import refuse_file
 
     name = target_format or _format_of(path)
     if name not in FORMATS:
@@ -190,6 +190,8 @@ def _contents(name: str, scene: _Scene) -> dict[str, bytes]:
     """Return the content of each file, by what its name has behind the target's stem: also another suffix."""
     images, world = scene.model.images, scene.world
     if name == "nerf" and scene.model.num_points:
+        from sfm_shapefit.report.mesh import nerf_files
+
         beside = f"{scene.stem}{_POINTS}"
         return dict(zip(("", _POINTS), nerf_files(scene.model, beside), strict=True))
     if name == "ply":
@@ -221,24 +223,6 @@ def _points_and_cameras(scene: _Scene) -> dict[str, bytes]:
         "": ply_bytes(world.places(points.xyz), points.colors, **how),
         "_cameras": ply_bytes(world.places(vertices), colors, faces, **how),
     }
-
-
-def nerf_files(model: "ColmapModel", points_file: str, masks: str = "") -> tuple[bytes, bytes]:
-    """Return the transforms.json of a model, and the PLY of all its points, to which it refers by that name.
-
-    Args:
-        model: in lenses that transforms.json knows.
-        points_file, masks: the file of the points and the folder of masks as seen from the transforms.json;
-            without masks its frames have none.
-    """
-    from sfm_shapefit.files.colmap.seed import pick_points
-    from sfm_shapefit.files.nerf import nerf_text
-    from sfm_shapefit.report.mesh import ply_bytes
-
-    points = pick_points(model.arrays, model.num_points)
-    text = nerf_text(model.images, points_file, masks)
-    ply = ply_bytes(points.xyz, points.colors, with_normals=True)
-    return text.encode(errors="backslashreplace"), ply
 
 
 def _covariances(scene: _Scene) -> str:

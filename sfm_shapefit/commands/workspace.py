@@ -23,7 +23,6 @@ from sfm_shapefit.base.geometry import Similarity, angle_between_deg
 from sfm_shapefit.base.paths import MASKS, refuse_no_folder
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.base.wording import counted, counted_are, first_of
-from sfm_shapefit.commands.convert import nerf_files
 from sfm_shapefit.facts.tables import model_datum
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, model_of, read_model
@@ -32,6 +31,7 @@ from sfm_shapefit.files.colmap.pinholes import Flat, flats_of, flatten_model, ma
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
 from sfm_shapefit.files.undistortion_options import UndistortionOptions
+from sfm_shapefit.report.mesh import nerf_files
 from sfm_shapefit.rotations.gravity import DOWN, turn_upright
 from sfm_shapefit.scene.level import find_up
 

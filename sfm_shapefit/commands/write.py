@@ -5,53 +5,26 @@ bare graph has no model. `map` has such a folder per model, `0`, `1`, ..., and `
 that were joined stand in `joined_0` in one world too.
 """
 
-import os
-from collections.abc import Collection, Iterable, Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
-from datetime import date
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_file, atomic_folder
 from sfm_shapefit.base.display import Reported, Writers
-from sfm_shapefit.base.errors import InputError, ShapeFitError
-from sfm_shapefit.base.paths import file_of, refuse_irregular_file, refuse_no_folder
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
-from sfm_shapefit.base.threads import count_threads
-from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.commands.colors import Result, with_colors
 from sfm_shapefit.facts.map_result import JoinedModel, MapResult
 from sfm_shapefit.facts.placed import IN_MEMORY, folder_of
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import covariances_of, covariances_text, own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, Table, write_rows
-from sfm_shapefit.files.colmap.database import open_database
-from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
-from sfm_shapefit.files.colmap.seed import pick_points, write_model
-from sfm_shapefit.files.colmap.track_matches import TrackMatches
-from sfm_shapefit.files.matching_options import MADE_FIRST, SIDECARS
-from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import Matches
-from sfm_shapefit.tracks.structure_options import StructureOptions
-
-if TYPE_CHECKING:
-    from sfm_shapefit.report.drawing import Drawing
-    from sfm_shapefit.report.matched import DrawnMatches
-
-Result = TypeVar("Result", bound=LocateResult | GraphResult | MapResult | JoinedModel)
-
-_PICKED = 1000  # points that are asked for a color; one that has it is enough
-_WRITTEN = {".html", ".glb", ".ply", ".csv", ".json", ".tum", ".txt"}
-"""Suffixes of single files that commands write, perhaps into the folder of a model."""
-_READ = {
-    *(MARKER, MAP_MARKER, "cameras.csv", "pairs.csv", "doubtful_pairs.csv"),
-    *(f"{name}.txt" for name in ("cameras", "images", "points3D", "rigs", "frames")),
-}
-"""Files with such suffixes that are part of a model or of an output."""
+from sfm_shapefit.files.colmap.seed import write_model
+from sfm_shapefit.files.matching_options import MADE_FIRST
+from sfm_shapefit.files.output_paths import refuse_file
 
 
 @explained
@@ -110,67 +83,6 @@ def deliver(found: Result, out: Path | str, options: WriteOptions) -> Result:
         else:
             _write_files(found, folder, Path(out), options)
     return found
-
-
-def has_colors(found: LocateResult | GraphResult | MapResult | JoinedModel) -> bool:
-    """Return whether points of a result, of several models the largest, have colors; none need no color."""
-    if isinstance(found, GraphResult):
-        return True
-    shown = found.models[0] if isinstance(found, MapResult) else found
-    picked = pick_points(shown.model if isinstance(shown, LocateResult) else shown.reconstruction, _PICKED)
-    return not picked.num_all or bool(picked.colors.any())
-
-
-def with_colors(found: Result, images: Path | str) -> Result:
-    """Return a result whose points without a color have that of the pictures which see them.
-
-    Pictures that are missing or cannot be read give none, and a warning says so.
-
-    Args:
-        found: the result; a bare graph has no points, and stays as it is.
-        images: folder of the pictures.
-
-    Raises:
-        InputError: if the folder is none.
-    """
-    if isinstance(found, GraphResult):
-        return found
-    refuse_no_folder(Path(images))
-    pictures = PictureFolder(Path(images), count_threads())
-    unread: set[str] = set()
-    colored: Any = _colored(found, pictures, unread)
-    warnings = [*found.warnings, *_color_warnings(pictures.folder, found.image_names, sorted(unread))]
-    if isinstance(found, JoinedModel):
-        told: dict[str, Any] = {"facts": replace(found.facts, warnings=warnings)}
-    else:
-        told = {"warnings": tuple(warnings)}
-    result: Result = replace(colored, **told)
-    return result
-
-
-def _colored(found: Any, pictures: PictureFolder, unread: set[str]) -> Any:
-    """Return a result with colors; names of unreadable pictures are added to `unread`."""
-    if isinstance(found, MapResult):
-        models = [_colored(one, pictures, unread) for one in found.models]
-        joined = [_colored(one, pictures, unread) for one in found.joined]
-        return replace(found, models=tuple(models), joined=tuple(joined))
-    if isinstance(found, JoinedModel):
-        model, missed = color_model(found.reconstruction, pictures)
-        unread.update(missed)
-        return replace(found, reconstruction=model)
-    seed, missed = found.seed.colored(pictures)
-    unread.update(missed)
-    further = [_colored(one, pictures, unread) for one in found.further]
-    return replace(found, seed=seed, further=tuple(further))
-
-
-def _color_warnings(folder: Path, names: Sequence[str], unread: Sequence[str]) -> list[str]:
-    missing, said = sum(file_of(folder, name) is None for name in names), []
-    if missing:
-        said.append(f"{folder} lacks {missing} of {counted(len(names), 'image')}: is it the right folder?")
-    if unread:
-        said.append(f"{counted(len(unread), 'picture')} in {folder} cannot be read: {first_of(unread)}")
-    return said
 
 
 def _inputs_of(found: Any) -> list[Path]:
@@ -235,110 +147,16 @@ def write_page(
     return Path(page)
 
 
-def refuse_file(page: Path, *, overwrite: bool, protect: Iterable[Path | str] = ()) -> None:
-    """Refuse a file to be made that exists, that an input is or consists of, or whose folder does not exist.
-
-    Args:
-        page: the file.
-        overwrite: accept an ordinary file in its place, but no link.
-        protect: the inputs, files and folders.
-    """
-    if not page.absolute().parent.is_dir():
-        raise InputError(f"the folder of {page} does not exist; make it, or name another")
-    if page.is_dir():
-        raise InputError(f"{page} is a folder; give the name of a file")
-    for source in map(Path, protect):
-        if _is_of(page, source):
-            raise InputError(f"{page} is or belongs to the input {source}; choose another name")
-    if os.path.lexists(page) and not overwrite:
-        raise InputError(f"{page} exists already; choose another name, or replace it (overwrite=True)")
-    if page.is_symlink():
-        raise InputError(f"{page} is a symbolic link; give the file that it stands for")
-    refuse_irregular_file(page)
-
-
-def _is_of(page: Path, source: Path) -> bool:
-    """Return whether a file is an input, a companion of one, or a file of a folder that is one."""
-    if not source.is_dir():
-        names = [source.name + suffix for suffix in ("", *SIDECARS)]
-        names += ["tracks.csv"] * (source.suffix.lower() == ".json")  # OpenSfM's
-        return any(_is_same(page, source.with_name(name)) for name in names)
-    if not page.exists():
-        return False
-    if Path(os.path.realpath(page)).is_relative_to(os.path.realpath(source)):
-        return _is_read(page)
-    return any(_is_read(entry) and _is_same(page, entry) for entry in source.iterdir())
-
-
-def _is_read(member: Path) -> bool:
-    """Return whether a file of a folder may be read as an input: pages, meshes and lists in it are not."""
-    return member.suffix.lower() not in _WRITTEN or member.name in _READ
-
-
-def _is_same(page: Path, other: Path) -> bool:
-    """Return whether two paths, which may not exist, lead to one file, however they are spelled."""
-    try:
-        return page.samefile(other)
-    except OSError:
-        return os.path.realpath(page) == os.path.realpath(other)
-
-
 def _draw_page(found: Any) -> str:
-    from sfm_shapefit.report.page import report_html
+    from sfm_shapefit.report.result_page import draw_page  # here: what draws is not loaded where nothing is
 
-    return report_html(_drawing_of(found), found.facts)
-
-
-def _drawing_of(found: Any) -> "Drawing":
-    from sfm_shapefit.report.results import draw_joined, draw_result
-
-    if isinstance(found, JoinedModel):
-        return draw_joined(found)
-    drawing: Drawing = draw_result(found) if hasattr(found, "placement") else found.drawing
-    return drawing
+    return draw_page(found)
 
 
 def _write_report(found: Any, page: Path, images: Path | str, out: str = "OUT") -> bool:
-    """Write a report, of several models that of the largest; False if pictures were asked for in vain."""
-    from sfm_shapefit.report.page import Occasion, Pictures, write_report
-    from sfm_shapefit.report.thumbnails import read_thumbnails
+    from sfm_shapefit.report.result_page import write_result_page
 
-    shown = found.models[0] if isinstance(found, MapResult) else found
-    drawing = _drawing_of(shown)
-    occasion = Occasion(out, day=date.today().isoformat())
-    if not str(images):
-        write_report(drawing, shown.facts, page, occasion=occasion)
-        return True
-    small = read_thumbnails(Path(images), drawing.cameras.names, drawing.cameras.trust)
-    pictures = Pictures(small, _matches_between(shown, drawing, small)) if small else None
-    occasion = occasion._replace(images=str(images)) if small else occasion
-    write_report(drawing, shown.facts, page, pictures, occasion)
-    return bool(small)
-
-
-def _matches_between(found: Any, drawing: "Drawing", pictures: Collection[int]) -> "DrawnMatches | None":
-    """Return the matches between pictures, of the database or else of the model's points.
-
-    None where there are none, or the database cannot be read any more.
-    """
-    from sfm_shapefit.report.matched import pick_matches
-
-    if isinstance(found, GraphResult):
-        return None
-    with suppress(ShapeFitError), ExitStack() as stack:
-        database = found.facts.inputs.database
-        if database and isinstance(found, LocateResult):
-            images: Images = found.placed
-            matches: Matches = open_database(database, images.names)
-        else:
-            model = read_model(found)
-            images = model.images
-            matches = open_database(database, images.names) if database else TrackMatches(model)
-        stack.callback(matches.close)
-        structure = found.options.structure if isinstance(found, LocateResult) else StructureOptions()
-        limit_px = structure.max_reprojection_error_px
-        return pick_matches(drawing.cameras, drawing.pairs, matches.at(images), pictures, limit_px)
-    return None
+    return write_result_page(found, page, images, out)
 
 
 WRITERS = Writers(_draw_page, write_page, write_result)

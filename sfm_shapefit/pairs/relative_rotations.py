@@ -32,7 +32,9 @@ class RelativeRotations:
     """(k, 3) unit vectors in axes of camera j, with which the rotations were found; None where none was."""
 
     def subset(self, rows: IntArray | BoolArray) -> Self:
-        """Return the given pairs, in that order."""
+        """Return the given pairs, in that order; these themselves if all are chosen, for memory."""
+        if rows.dtype == np.bool_ and rows.all():
+            return self
         columns: dict[str, Any] = {
             field.name: getattr(self, field.name) for field in fields(RelativeRotations)
         }

@@ -28,12 +28,14 @@ from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
-from sfm_shapefit.pipeline.inputs import inputs_from, read_left_out
+from sfm_shapefit.pipeline.inputs import MatchSource, inputs_from, read_left_out, see_matches
 from sfm_shapefit.pipeline.intrinsics import choose_intrinsics
+from sfm_shapefit.pipeline.memory import largest_group, see_within_limit
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.placement.gauge_rule import between_images
+from sfm_shapefit.placement.memory_plan import MEMORY_PLANS, MemoryPlan
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
-from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
+from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.averaging_options import AveragingOptions
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
@@ -87,7 +89,7 @@ def start_run(
             scale_bars=gauge.scale_bars,
             gravity=options.averaging.gravity,
         )
-    return MapContext(
+    run = MapContext(
         options=replace(options, gauge=gauge),
         clock=clock,
         matches=matches,
@@ -97,6 +99,8 @@ def start_run(
         known=known,
         without=inputs.left_out,
     )
+    with clock("read"):
+        return run.within_limit()
 
 
 class MapContext(NamedTuple):
@@ -115,6 +119,23 @@ class MapContext(NamedTuple):
     """Pairs that are taken for unmatched."""
     scores: PairScores = PairScores()
     """Scores of pairs of images."""
+    memory_plan: MemoryPlan = MEMORY_PLANS[0]
+    """What is given up for memory where the matches of all images are read."""
+
+    def within_limit(self) -> "MapContext":
+        """Return the run with what is given up for the limit of memory.
+
+        InputError: if the largest group of images that pairs tie takes more, whatever is given up.
+        """
+        if not self.options.memory.max_memory_mb:
+            return self
+        largest = largest_group(see_matches(self.matches, self.images, self.inputs))
+        source = self.see(self.images.part(largest), self.inputs)
+        return self._replace(memory_plan=source.memory_plan)
+
+    def see(self, images: Images, inputs: Inputs) -> MatchSource:
+        """Return the matches as images of a component see them, within the limit of memory."""
+        return see_within_limit(see_matches(self.matches, images, inputs), self.options, is_component=True)
 
     def measure(self) -> RelativeRotations:
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
@@ -123,7 +144,7 @@ class MapContext(NamedTuple):
 
     def view(self) -> View:
         """Return the matches of all images in axes of their cameras, but for the pairs that are left out."""
-        return self.matches.at(self.images.apart(), self.without)
+        return self.matches.at(self.images.apart(), self.without, self.memory_plan.reading)
 
     def find_videos(self, relative: RelativeRotations) -> Videos:
         """Return the videos among the images, as far as the options want to know of them."""
@@ -142,7 +163,7 @@ class MapContext(NamedTuple):
             verdict = judge_loops(videos, self.images.names, relative, self.clock.threads)
         names = self.images.names
         refused = {(names[i], names[j]) for i, j in relative.pairs[verdict.refused].tolist()}
-        kept = np.delete(np.arange(len(relative.pairs)), verdict.refused)
+        kept = ~np.isin(np.arange(len(relative.pairs)), verdict.refused)
         without = self.without | {(min(pair), max(pair)) for pair in refused}
         return self._replace(without=without), relative.subset(kept), verdict.loops
 
@@ -263,6 +284,8 @@ class ComponentAveraging(NamedTuple):
             answer = replace(chosen.averaged, num_repeated=repeated, num_rivals=rivals)
         if self.gravity is None:
             return answer
+        from sfm_shapefit.rotations.gravity import refine_with_gravity  # it loads long
+
         return refine_with_gravity(answer, local, self.gravity.of(members))
 
 
@@ -283,15 +306,3 @@ def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:
     """Return the connected components, ascending, the largest first; single frames are components too."""
     groups = RowLists.by_label(connected_components(num_frames, pairs))
     return sorted(groups, key=lambda group: (-len(group), int(group[0])))
-
-
-def refine_with_gravity(
-    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
-) -> AveragedRotations:
-    """Return averaged rotations of frames refined on their pairs and gravities together."""
-    from sfm_shapefit.rotations.gravity import with_gravity  # it loads long
-
-    supports = relative.weight_shares * relative.num_matches
-    count = len(averaged.registered)
-    given = check_pairs(relative.pairs, relative.rotations, relative.information, supports, count)
-    return with_gravity(averaged, given, gravity)

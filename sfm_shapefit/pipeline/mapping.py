@@ -20,7 +20,6 @@ from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import MapContext, pairs_among
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, see_matches
-from sfm_shapefit.pipeline.memory import see_within_limit
 from sfm_shapefit.pipeline.model_joins import JoinInputs, judge_joins, merge_groups, tell_group
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.remedies import at_one_center, make_model
@@ -45,7 +44,7 @@ def refine_intrinsics(run: MapContext, relative: RelativeRotations) -> Images:
     images, is_known = run.images, np.zeros(len(run.images.lenses), dtype=np.bool_)
     for _, members, averaging in run.average_images(relative, {}):
         inputs = _inputs_of(run, members, averaging).without_positions()
-        source = see_within_limit(see_matches(run.matches, inputs.images, run.inputs), run.options)
+        source = run.see(inputs.images, run.inputs)
         with suppress(UnsolvableError):
             try:
                 first = _place_first(inputs, source, run.clock)
@@ -113,7 +112,7 @@ def _locate_component(
     _, among = pairs_among(relative, members)
     if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
         read = replace(read, left_out=read.left_out | _false_pairs(inputs.images, among, averaging))
-    source = see_within_limit(see_matches(run.matches, inputs.images, read), run.options)
+    source = run.see(inputs.images, read)
     source = replace(source, alone=among)
     result = make_model(inputs, source, run.clock)
     return replace(

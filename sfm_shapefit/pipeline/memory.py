@@ -1,12 +1,13 @@
-"""How much memory `locate` will take, told beforehand, and what is given up to stay below a limit.
+"""How much memory `locate` and `map` take, told beforehand, and what is given up to stay below a limit.
 
 The peak is that of the worst stage, for memory is handed back between stages. Every stage is linear in what
 it works on: keypoints, matches, pairs, edges of the graph, and entries of the factor, which the symbolic
 analysis knows beforehand. The bytes per item below were fitted to runs on seven sets of 25 to 10,000 images:
 forecasts are 1.02 to 1.2 times the peaks, with a limit of 1,500 MB at 10,000 images, too.
 
-The limit is looked at twice before anything is solved: with the counts of the database, and once the graph is
-known. What can be given up is listed in `MEMORY_PLANS`, the cheapest first; the first that fits is taken.
+The limit is looked at before anything is solved: with the counts of the database, for `map` with those of the
+largest group that its pairs tie, and once the graph is known. What can be given up is listed in
+`MEMORY_PLANS`, the cheapest first; the first that fits is taken.
 """
 
 from dataclasses import dataclass, replace
@@ -14,11 +15,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sfm_shapefit.adjustment.run import FINE_TIMES, MOST_WHOLE
+from sfm_shapefit.adjustment.solve import MANY_ENTRIES
+from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.facts.command_options import InspectOptions, PlacingOptions
 from sfm_shapefit.files.colmap.database import MOST_KEYPOINTS, PIXEL_BYTES
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.laplacian.factor import analyze
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import are_sampled
@@ -26,6 +32,7 @@ from sfm_shapefit.placement.memory_plan import MEMORY_PLANS, MemoryPlan
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.matches import KEPT_MATCHES, MOST_BESIDE_TRACKS
 from sfm_shapefit.solver.solve import choose_method, plan_factor
+from sfm_shapefit.tracks.thin_tracks import wanted_observations
 
 if TYPE_CHECKING:
     from sfm_shapefit.facts.inspected import Forecast
@@ -40,12 +47,19 @@ _BLOCK = 9  # entries of a block of the factor; three coordinates by three
 _OBSERVATIONS_OF_A_MATCH = 0.7  # observations for a match, if keypoints are more; .45 to .66 measured
 _OBSERVATION_BYTES = 420.0  # bytes of an observation; its track, and its part of the normal equations
 _DIVIDED_BYTES = 270.0  # the same where adjustments are divided: a part has normal equations at a time
+_KEPT_BYTES, _ENTRY_BYTES = 60.0, 150.0  # bytes of an observation of few tracks; with its point, linearized
+_OVERSHOT = 1.2  # observations of few tracks for each that an image wants; 1.13 measured
+_THIN_PAIRS, _THIN_FACTOR = 1.9, 1.8
+"""Pairs of cameras that meet in few tracks, for each of the graph; blocks of their factor, likewise."""
+_ITERATIVE_BYTES = 30e3  # bytes of a camera; the factors of its blocks in the preconditioner
+_AVERAGED_BLOCKS, _AVERAGED_FACTORS = 10.0, 1.2
+"""Blocks that averaging holds for each pair; for each block of the factor too, with its update matrices."""
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000  # unknowns of an adjusted camera; up to as many, their system is dense
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Workload:
-    """What `locate` has to work on."""
+    """What a run has to work on."""
 
     num_images: int
     num_keypoints: int
@@ -64,6 +78,8 @@ class Workload:
     """Blocks of the factor, its stack included; 0 where there is none."""
     adjusts: bool = False
     """Whether placed cameras are adjusted by their matches."""
+    averages: bool = False
+    """Whether rotations are averaged, and a first placement by them is adjusted on few tracks."""
     adjusts_bundle: bool = False
     """Whether the seed goes through bundle adjustment, which cannot be given up."""
     needs_factor: bool = False
@@ -150,6 +166,9 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
         "reading": _STARTED_BYTES + 30e6 + _READ_BYTES * work.num_keypoints,
         "measuring directions": throughout + batch,
     }
+    if work.averages:
+        blocks = 8.0 * _BLOCK * (_AVERAGED_BLOCKS * work.num_pairs + _AVERAGED_FACTORS * work.factor_entries)
+        peaks["averaging rotations"] = throughout - rays + blocks
     if work.has_points and plan.points:
         peaks["building tracks"] = throughout + batch + 125.0 * work.num_keypoints
     samples = 16.0 * _SAMPLES * (work.num_sampled if plan.samples else 0)
@@ -165,6 +184,11 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
     if work.num_matches > MOST_BESIDE_TRACKS:
         tracks -= in_memory
     seeded = throughout + kept + 300.0 * work.num_edges + tracks
+    if work.averages:
+        few, solving = _first_placement_bytes(work, plan)
+        given_up = in_memory if work.num_matches > MOST_BESIDE_TRACKS else 0.0
+        peaks["triangulating a first placement"] = seeded - rays + few
+        peaks["adjusting a first placement"] = throughout - rays - given_up + few + solving
     if work.adjusts_bundle or (work.adjusts and plan.adjustment):
         observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches)
         size = _DIVIDED_BYTES if plan.divides else _OBSERVATION_BYTES
@@ -172,6 +196,22 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
         peaks["adjusting"] = seeded + adjusting
     peaks["triangulating"] = seeded - rays
     return peaks
+
+
+def _first_placement_bytes(work: Workload, plan: MemoryPlan) -> tuple[float, float]:
+    """Return the bytes of the few tracks that are adjusted, and of the equations and the factor beside these.
+
+    Many observations are not linearized while there is a factor; where divided, those of a part alone.
+    """
+    most = _OVERSHOT * wanted_observations(work.num_images, FINE_TIMES) * work.num_images
+    observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches, most)
+    kept = _KEPT_BYTES * observations
+    entries, block = _ENTRY_BYTES * observations, 8.0 * _UNKNOWNS**2
+    system = 2.0 * block * _THIN_PAIRS * work.num_pairs
+    if plan.divides or work.num_images > MOST_WHOLE:
+        return kept, system + _ITERATIVE_BYTES * work.num_images
+    solving = system + 0.5 * block * _THIN_FACTOR * work.factor_entries  # the factor has numbers of 32 bits
+    return kept, max(entries, solving) if observations > MANY_ENTRIES else entries + solving
 
 
 def _adjusted_cameras_bytes(work: Workload) -> float:
@@ -201,13 +241,28 @@ def _read_work(source: MatchSource, options: PlacingOptions | InspectOptions) ->
     )
 
 
-def see_within_limit(source: MatchSource, options: PlacingOptions) -> MatchSource:
-    """Return the matches of a database with what is given up, by their counts, for the limit of memory."""
+def see_within_limit(
+    source: MatchSource, options: PlacingOptions, *, is_component: bool = False
+) -> MatchSource:
+    """Return the matches of a database with what is given up, by their counts, for the limit of memory.
+
+    Images that are a component of `map` get a first placement. InputError as of `choose_memory_plan`.
+    """
     if not options.memory.max_memory_mb or not source.has_database:
         return source
     bare, images = _read_work(source, options), source.images
+    if is_component:
+        entries = analyze(images.num_images, source.view.pairs).num_bytes(1, np.uint8)
+        averages = options.freedom.adjust != "none"
+        bare = replace(bare, averages=averages, adjusts=False, factor_entries=entries)
     work = replace(bare, has_points=options.nodes.uses_points(images.num_images))
     return source.at(images, choose_memory_plan(work, bare, options.memory.max_memory_mb))
+
+
+def largest_group(source: MatchSource) -> IntArray:
+    """Return the images of the largest group that pairs tie, ascending."""
+    label_of = connected_components(source.images.num_images, source.view.pairs)
+    return np.flatnonzero(label_of == np.bincount(label_of).argmax())
 
 
 def count_work(

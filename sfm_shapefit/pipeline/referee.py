@@ -13,12 +13,10 @@ where its cameras stand. It is not to be used for the evidence of `judgement.gra
 to be looked at.
 """
 
-from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,24 +25,19 @@ from sfm_shapefit.adjustment.sources import collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.clock import Clock
-from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.wording import counted
+from sfm_shapefit.facts.check_result import CheckResult, checked_camera_rows, checked_pair_rows
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.scale_bars import MeasuredBars
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table, contradicting, model_options
+from sfm_shapefit.facts.tables import contradicting, model_options
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
+from sfm_shapefit.judgement.check_reasons import CheckedModel, of_alike_pictures, reasons_against
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.grade import too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
 from sfm_shapefit.judgement.reasons import (
-    ARE_ITS_PICTURES,
-    IS_ITS_DATABASE,
-    Grade,
     Kind,
     ModelVerdict,
     Reason,
@@ -52,7 +45,6 @@ from sfm_shapefit.judgement.reasons import (
 )
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models
-from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence
@@ -63,51 +55,6 @@ from sfm_shapefit.scene.matches import is_among
 from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.structure_options import StructureOptions
-
-if TYPE_CHECKING:
-    import pycolmap
-
-    from sfm_shapefit.report.drawing import Drawing
-
-_ROUNDING = 1e-9  # share of the largest coordinate; cameras no farther apart stand at the same place
-
-
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class CheckResult(Reported, Stated):
-    """The verdict on a model, with the evidence for it."""
-
-    model: ColmapModel
-    cameras: Table[CameraRow]
-    """One row per image, those with a pose first; the reason says what is weak about a camera."""
-    pairs: Table[PairRow]
-    """One row per pair that was looked at."""
-    quality: ImageQuality
-    facts: CheckedFacts
-    """The figures, as `check --json` prints them."""
-    second_opinion: MapResult | None = None
-    """What `map_database` made of the same matches, to compare with."""
-
-    @property
-    def reconstruction(self) -> "pycolmap.Reconstruction":
-        """The model as read, so that the result serves as a model."""
-        return self.model.reconstruction
-
-    @cached_property
-    def drawing(self) -> "Drawing":
-        """The scene, with what the page shows of each image."""
-        from sfm_shapefit.report.results import draw_checked
-
-        return draw_checked(self.model, self.cameras, self.pairs, self.quality)
-
-    def with_bars(self, bars: MeasuredBars | None) -> "CheckResult":
-        """Return the same with scale bars that were compared with the model."""
-        if bars is None:
-            return self
-        warnings = [*self.facts.warnings, *bars.warnings()]
-        return replace(self, facts=replace(self.facts, scale_bars=bars.rows(), warnings=warnings))
-
-    def _headline(self) -> str:
-        return f"{self.facts.num_placed} of {self.facts.num_images} images, {self.verdict.statement}"
 
 
 class OtherModel(NamedTuple):
@@ -227,11 +174,22 @@ def compare_with_other(state: CheckState) -> CheckState:
 
 def grade_model(state: CheckState, clock: Clock) -> CheckState:
     """Weigh what speaks against the model; an input in another convention or resolution explains the rest."""
-    reasons, source = tuple(_reasons(state)), state.source
+    source = state.source
+    known = CheckedModel(
+        images=state.images,
+        fits=state.fits,
+        evidence=state.evidence,
+        weak=state.weak,
+        has_points=bool(state.model.num_points or state.structure.points.num_points),
+        has_database=source.has_database,
+        is_matched_here=source.inputs.is_made,
+        num_missing=len(source.matches.missing_names),
+    )
+    reasons = tuple(reasons_against(known))
     verdict = ModelVerdict.weigh(reasons)
     if verdict.is_bad and (far := source.inputs.far):
         near = check_source(state.model, source.without(far), state.options, clock.anew()).verdict
-        verdict = verdict if near.is_bad else ModelVerdict.weigh(_of_alike_pictures(verdict.findings))
+        verdict = verdict if near.is_bad else ModelVerdict.weigh(of_alike_pictures(verdict.findings))
     recognized = recognize_resolution(*state.structure[:3])
     if verdict.is_bad and recognized is None:
         recognized = ask_convention(source, clock.threads)
@@ -242,9 +200,11 @@ def grade_model(state: CheckState, clock: Clock) -> CheckState:
 def finish_check(state: CheckState, clock: Clock) -> CheckResult:
     """Return the result: tables of cameras and pairs, and the figures."""
     model, source, fits, quality = state.model, state.source, state.fits, state.quality
-    pairs = _pair_rows(state.images, fits)
+    pairs = checked_pair_rows(state.images, fits)
     named = [one for one in state.reasons if one.of_each and one.kind is not Kind.SECOND_OPINION]
-    cameras = _camera_rows(model, fits, [*state.weak, *(one for one in named if one not in state.weak)])
+    cameras = checked_camera_rows(
+        model, fits, [*state.weak, *(one for one in named if one not in state.weak)]
+    )
     residuals_deg = pairs.columns["residual_deg"]
     error_deg = _median(residuals_deg[np.isfinite(residuals_deg) & ~contradicting(pairs)].tolist())
     errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
@@ -281,92 +241,6 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
         facts=facts,
         second_opinion=state.other and state.other.source,
     )
-
-
-def _of_alike_pictures(findings: Iterable[Reason]) -> Iterator[Reason]:
-    """Yield findings of pairs far apart in pose alone: where sides are alike, a sound model has them, too."""
-    clause = (
-        "pictures of cameras far apart contradict it, neighbors do not: the scene repeats, or it is folded"
-    )
-    yield of_model(Kind.REPEATED, clause)
-    yield from (replace(one, grade=min(one.grade, Grade.LOOK, key=list(Grade).index)) for one in findings)
-
-
-def _pair_rows(images: Images, fits: PairFits | None) -> Table[PairRow]:
-    if fits is None:
-        return Table(PairRow, 3, {"name1": []})
-    directions, is_judged = fits.directions, np.isfinite(fits.residuals_deg)
-    columns = {
-        "name1": images.names_of(directions.pairs[:, 0]),
-        "name2": images.names_of(directions.pairs[:, 1]),
-        "direction": np.where(is_judged[:, None], directions.directions, np.nan),
-        "support": directions.num_inliers,
-        "residual_deg": fits.residuals_deg,
-        "verdict": np.where(fits.contradicts, Verdict.OUTLIER.value, Verdict.INLIER.value),
-        "reason": np.where(is_judged, "", [status.value for status in directions.status]),
-    }
-    return Table(PairRow, 3, columns)
-
-
-def _camera_rows(model: ColmapModel, fits: PairFits | None, weak: list[Reason]) -> Table[CameraRow]:
-    """Return a row per image, those with a pose first."""
-    names, others = model.images.names, sorted(set(model.image_names) - set(model.images.names))
-    judged = np.zeros((0, 2), dtype=np.int64)
-    if fits is not None:
-        judged = fits.directions.pairs[np.isfinite(fits.residuals_deg)]
-    clauses: dict[str, list[str]] = {name: [] for name in names}
-    for one in weak:
-        for name in one.images:
-            clauses.setdefault(name, []).append(one.sentence)
-    columns = {
-        "name": names,
-        "placed": [True] * len(names),
-        "reason": ["; ".join(clauses[name]) for name in names],
-        "piece": [0] * len(names),
-        "center": model.images.centers,
-        "degree": np.bincount(judged.ravel(), minlength=len(names)),
-    }
-    reasons = ["it has no pose in the model"] * len(others)
-    unposed = Table(CameraRow, 3, {"name": others, "reason": reasons})
-    return Table(CameraRow, 3, columns).followed_by(unposed)
-
-
-def _reasons(state: CheckState) -> Iterator[Reason]:
-    """Yield what speaks against a model; a weak camera that stands where another model has it is right."""
-    model, structure, source = state.model, state.structure, state.source
-    fits, evidence = state.fits, state.evidence
-    pointless = not (model.num_points or structure.points.num_points)
-    centers = model.images.centers
-    if np.ptp(centers, axis=0).max() <= _ROUNDING * np.abs(centers).max():
-        clause = "all its cameras are at the same place; place them with sfm-shapefit locate"
-        yield of_model(Kind.PLACE, clause, Grade.DO_NOT_USE)
-        return
-    if fits is None or not (fits.contradicts.any() or np.isfinite(fits.residuals_deg).any()):
-        is_bare = pointless and not source.inputs.database
-        clause = "no two of its images have matches that say where they are relative to each other"
-        clause = "it has no 3D points, and no database was given or found" if is_bare else clause
-        yield of_model(Kind.UNCHECKED, clause, Grade.CANNOT_BE_JUDGED)
-    yield from too_few_to_judge(model.images.num_images)
-    against = list(weigh_evidence(evidence, model.images))
-    yield from against
-    if fits is not None and not any(one.grade is Grade.DO_NOT_USE for one in against):
-        yield from _none_agrees(fits, source)
-    yield from (one for one in state.weak if not evidence.opinion.confirmed.issuperset(one.images))
-    if pointless:
-        clause = "it has no 3D points, so that only matches support where its cameras are"
-        yield of_model(Kind.POINTS, clause)
-    if num_missing := len(source.matches.missing_names):
-        clause = f"the database lacks {counted(num_missing, 'image')}: {IS_ITS_DATABASE}"
-        yield of_model(Kind.INPUT, clause)
-
-
-def _none_agrees(fits: PairFits, source: MatchSource) -> Iterator[Reason]:
-    """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
-    if (against := int(fits.contradicts.sum())) and not fits.agrees.any():
-        whose = ARE_ITS_PICTURES if source.inputs.is_made else IS_ITS_DATABASE
-        question = f": {whose}" * (source.inputs.database is not None)
-        pairs = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
-        yield of_model(Kind.INPUT, f"{pairs} and none agrees{question}", Grade.DO_NOT_USE)
 
 
 def _median(values: list[float]) -> float:

@@ -76,6 +76,8 @@ def place_rigid_pieces(state: ModelState, clock: Clock) -> list[ModelState]:
     with clock("solve"):
         graph = state.rigid.apply(build_graph(images, measured, options.nodes))
         work = count_work(state.source, measured.directions, options)
+        if state.first is not None and state.inputs.known.priors is None:  # see `adjust_cameras`
+            work = replace(work, adjusts=False)
         plan, graph = keep_within_memory(graph, work, options, state.source.memory_plan)
         measured = measured if plan.samples else replace(measured, errors=None)
         limited = plan.limit(options.placement)

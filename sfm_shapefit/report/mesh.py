@@ -19,6 +19,8 @@ from sfm_shapefit.report.drawing import Drawing, frustum_corners
 if TYPE_CHECKING:
     import trimesh
 
+    from sfm_shapefit.files.colmap.model import ColmapModel
+
 Colors = npt.NDArray[np.uint8]
 
 _FLOAT32 = 2.0**-24  # share of a coordinate; what rounding to 32 bits moves it by at most
@@ -113,3 +115,20 @@ def _mesh(vertices: FloatArray, faces: IntArray, colors: Colors) -> "trimesh.Tri
 
 def _opaque(colors: npt.NDArray[np.integer]) -> Colors:
     return np.concatenate([colors, np.full((len(colors), 1), 255)], axis=1).astype(np.uint8)
+
+
+def nerf_files(model: "ColmapModel", points_file: str, masks: str = "") -> tuple[bytes, bytes]:
+    """Return the transforms.json of a model, and the PLY of all its points, to which it refers by that name.
+
+    Args:
+        model: in lenses that transforms.json knows.
+        points_file, masks: the file of the points and the folder of masks as seen from the transforms.json;
+            without masks its frames have none.
+    """
+    from sfm_shapefit.files.colmap.seed import pick_points
+    from sfm_shapefit.files.nerf import nerf_text
+
+    points = pick_points(model.arrays, model.num_points)
+    text = nerf_text(model.images, points_file, masks)
+    ply = ply_bytes(points.xyz, points.colors, with_normals=True)
+    return text.encode(errors="backslashreplace"), ply

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import angle_between, normalized
-from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 from sfm_shapefit.rotations.annealing import (
     LAST_REDUCTION,
     LONGEST_STEP,
@@ -31,6 +31,7 @@ from sfm_shapefit.rotations.annealing import (
     AveragingPairs,
     Linearized,
 )
+from sfm_shapefit.rotations.average import check_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.averaging_kernels import turn_cameras, weigh_blocks
 from sfm_shapefit.rotations.averaging_system import AveragingSystem, plan_system
@@ -201,3 +202,13 @@ def _shortest_turns(sources: FloatArray, target: FloatArray) -> Rotation:
     axes[opposite] = np.cross(target, np.eye(3)[int(np.argmin(np.abs(target)))])
     angles = angle_between(sources, np.broadcast_to(target, sources.shape))
     return Rotation.from_rotvec(angles[:, None] * normalized(axes))
+
+
+def refine_with_gravity(
+    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
+) -> AveragedRotations:
+    """Return averaged rotations of frames refined on their pairs and gravities together."""
+    supports = relative.weight_shares * relative.num_matches
+    count = len(averaged.registered)
+    given = check_pairs(relative.pairs, relative.rotations, relative.information, supports, count)
+    return with_gravity(averaged, given, gravity)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, Int32Array, IntArray
 from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
@@ -37,11 +37,11 @@ class ObservedTracks(Lists):
 
     offsets: IntArray
     """(t + 1,)"""
-    cameras: IntArray
+    cameras: IndexArray
     """(m,) the camera of each observation."""
-    keypoints: IntArray
+    keypoints: IndexArray
     """(m,) which of the camera's keypoints it is."""
-    pixels: FloatArray
+    pixels: npt.NDArray[np.floating]
     """(m, 2) as the adjustment's lens takes them."""
     on_plane: FloatArray
     """(m, 2) x/z and y/z of the ray in axes of the camera; NaN for rays that do not point ahead."""
@@ -59,7 +59,7 @@ class ObservedTracks(Lists):
         """Return the given tracks, in that order."""
         return self._of_rows(self.rows_of(chosen), self.ids[chosen])
 
-    def of_points(self, points_seen: IntArray) -> "ObservedTracks":
+    def of_points(self, points_seen: IndexArray) -> "ObservedTracks":
         """Return the tracks of points, one each: what observations (m,) see, -1 for those to be left out."""
         if np.array_equal(points_seen, self.list_of_rows()):
             return replace(self, ids=np.arange(self.num_tracks))  # as of matches, and large
@@ -142,9 +142,9 @@ class MatchedKeypoints:
         rows = joined.rows
         return ObservedTracks(
             offsets=joined.offsets,
-            cameras=self.cameras[rows].astype(np.int64),
-            keypoints=self.keypoints[rows].astype(np.int64),
-            pixels=self.pixels[rows].astype(np.float64),
+            cameras=self.cameras[rows],
+            keypoints=self.keypoints[rows],
+            pixels=self.pixels[rows],
             on_plane=self.on_plane[rows],
             ids=np.arange(len(joined.offsets) - 1),
         )

@@ -16,8 +16,9 @@ order of the images.
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt64Array
+from sfm_shapefit.base.arrays import IntArray, UInt64Array
 from sfm_shapefit.base.jit import kernel, mix_bits
 
 _LONG = 6  # views; longer tracks come no earlier, see the header
@@ -28,8 +29,13 @@ _MAYBE_JOINED, _FAR_LONGER = 100, 4.0
 _TURN = np.uint64(0x9E3779B97F4A7C15)  # multiplier of the second coordinate; the increment of splitmix64
 
 
+def wanted_observations(num_images: int, times: int = 1) -> int:
+    """Return how many observations each of so many images wants; arguments as of `choose_thin_tracks`."""
+    return times * max(_WANTED, _WANTED_IN_ALL // max(num_images, 1))
+
+
 def choose_thin_tracks(
-    offsets: IntArray, images: IntArray, pixels: FloatArray, num_images: int, times: int = 1
+    offsets: IntArray, images: IntArray, pixels: npt.NDArray[np.floating], num_images: int, times: int = 1
 ) -> IntArray:
     """Return tracks that together hold every image, ascending.
 
@@ -43,7 +49,7 @@ def choose_thin_tracks(
     lengths = np.diff(offsets)
     order = np.lexsort((_draw(offsets, pixels), -np.minimum(lengths, _LONG)))
     order = order[lengths[order] <= _longest(lengths)]
-    wanted = times * max(_WANTED, _WANTED_IN_ALL // max(num_images, 1))
+    wanted = wanted_observations(num_images, times)
     taken = np.zeros(len(lengths), dtype=np.bool_)
     _choose(order, offsets, images, wanted, np.zeros(num_images, dtype=np.int64), taken)
     return np.flatnonzero(taken)
@@ -56,7 +62,7 @@ def _longest(lengths: IntArray) -> float:
     return max(_MAYBE_JOINED, _FAR_LONGER * float(np.quantile(lengths, 0.9)))
 
 
-def _draw(offsets: IntArray, pixels: FloatArray) -> UInt64Array:
+def _draw(offsets: IntArray, pixels: npt.NDArray[np.floating]) -> UInt64Array:
     """Return a random number of each track, (t,), that its pixels alone determine."""
     bits = np.ascontiguousarray(pixels, dtype=np.float64).view(np.uint64)
     mixed = mix_bits(mix_bits(bits[:, 0]) + _TURN * bits[:, 1])

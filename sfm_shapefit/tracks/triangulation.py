@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.lists import RowLists, offsets_of
@@ -62,7 +62,7 @@ class TriangulatedPoints:
     """(k, 3)"""
     tracks: IntArray
     """(k,) the track of each."""
-    points_seen: IntArray
+    points_seen: IndexArray
     """(m,) the point of each observation of the tracks, -1 for those that are of none."""
 
     @classmethod
@@ -76,7 +76,7 @@ class TriangulatedPoints:
         """Return the points with at least that many observations; the observations of others are of none."""
         seen = self.points_seen
         kept = np.bincount(seen[seen >= 0], minlength=len(self.points)) >= least
-        place = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
+        place = np.append(np.where(kept, np.cumsum(kept, dtype=np.int32) - 1, -1), np.int32(-1))
         return TriangulatedPoints(points=self.points[kept], tracks=self.tracks[kept], points_seen=place[seen])
 
 
@@ -92,7 +92,7 @@ def triangulate_tracks(
         threads: number of threads to share the tracks among.
     """
     lengths = tracks.lengths()
-    seen = np.full(len(tracks.cameras), -1)
+    seen = np.full(len(tracks.cameras), -1, dtype=np.int32)
     room = offsets_of(lengths // max(limits.min_length, 2))  # for the points of each track
     points = np.empty((int(room[-1]), 3))
     track_of = np.empty(len(points), dtype=np.int64)
@@ -101,8 +101,8 @@ def triangulate_tracks(
     )
     most = limits.most_points if tracks.may_split else 1
     given = (
-        tracks.offsets, tracks.cameras, tracks.on_plane, poses.rotations, poses.centers,
-        poses.focal_lengths_px, poses.images, figures, most, int(lengths.max(initial=0)),
+        tracks.offsets, tracks.cameras.astype(np.int32, copy=False), tracks.on_plane, poses.rotations,
+        poses.centers, poses.focal_lengths_px, poses.images, figures, most, int(lengths.max(initial=0)),
     )  # fmt: skip
     number = max(len(seen) // _SLICE, _SLICES_A_THREAD * threads if threads > 1 else 1)
     cuts = np.searchsorted(tracks.offsets, np.arange(1, number) * len(seen) // number).tolist()
@@ -113,7 +113,7 @@ def triangulate_tracks(
         return np.arange(first, _triangulate(*own, first, given, points, track_of, seen))
 
     kept = np.concatenate(list(in_threads(threads, fill, slices)))
-    place = np.full(len(points) + 1, -1)
+    place = np.full(len(points) + 1, -1, dtype=np.int32)
     place[kept] = np.arange(len(kept))
     return TriangulatedPoints(points=points[kept], tracks=track_of[kept], points_seen=place[seen])
 
@@ -166,7 +166,7 @@ def triangulate_matches(
     return matched.observed(tracks), TriangulatedPoints(
         points=np.concatenate([points for points, _ in parts]),
         tracks=np.arange(len(tracks.offsets) - 1),
-        points_seen=tracks.list_of_rows(),
+        points_seen=tracks.spread(np.arange(len(tracks.offsets) - 1, dtype=np.int32)),
     )
 
 

@@ -226,7 +226,7 @@ def test_a_factor_of_32_bits_leads_where_a_dense_one_leads_on_a_long_row(bend):
 def test_entries_given_up_while_a_system_is_factored_change_nothing(monkeypatch, solver):
     _, start = make_start()
     kept = adjust(start, TIGHT, linear_solver=solver)
-    monkeypatch.setattr(adjustment_solve, "_MANY_ENTRIES", 0)
+    monkeypatch.setattr(adjustment_solve, "MANY_ENTRIES", 0)
     given_up = adjust(start, TIGHT, linear_solver=solver)
     np.testing.assert_array_equal(given_up.problem.centers, kept.problem.centers)
     np.testing.assert_array_equal(given_up.problem.points, kept.problem.points)

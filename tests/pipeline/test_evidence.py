@@ -13,9 +13,10 @@ from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.commands.check import check
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.reasons import Grade
+from sfm_shapefit.judgement.tied_groups import lost_points
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline import examination as evidence
-from sfm_shapefit.pipeline.examination import Structure, images_to_ask, lost_points
+from sfm_shapefit.pipeline.examination import Structure, images_to_ask
 from sfm_shapefit.pipeline.inputs import inputs_from, open_source
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.scene.lens import Lens

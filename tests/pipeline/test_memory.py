@@ -1,6 +1,7 @@
 """Memory told beforehand: limits that are kept, refused with the number needed, and what is given up."""
 
 import re
+import tracemalloc
 from dataclasses import fields, replace
 
 import numpy as np
@@ -8,10 +9,14 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import InputError
+from sfm_shapefit.adjustment.adjustment_options import AdjustmentOptions
+from sfm_shapefit.adjustment.layout import lay_out
+from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.facts.command_options import LocateOptions
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.laplacian.factor import analyze
 from sfm_shapefit.pipeline.memory import (
     Workload,
     choose_memory_plan,
@@ -23,6 +28,8 @@ from sfm_shapefit.placement.memory_plan import MEMORY_PLANS
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.solver.solver_options import NO_FACTOR
 from sfm_shapefit.synthetic import random_graph_problem
+from tests.adjustment.made import disturb
+from tests.adjustment.test_iterative import make_wall
 from tests.scenes import RING
 
 WORK = Workload(
@@ -48,7 +55,7 @@ def test_neither_a_cheaper_economy_nor_less_work_needs_more_memory(name):
     more = replace(
         WORK,
         **{
-            name: {"has_points": True, "adjusts": True, "adjusts_bundle": True}.get(
+            name: {"has_points": True, "adjusts": True, "averages": True, "adjusts_bundle": True}.get(
                 name, 2 * getattr(WORK, name)
             )
         },
@@ -182,6 +189,34 @@ def test_locate_keeps_a_limit_or_names_the_one_that_can_be_kept_and_a_large_one_
     assert np.isfinite(found.placement.assessment.sigmas).all()
     np.testing.assert_array_equal(limited.placement.locations, usual.placement.locations)
     assert limited.warnings == usual.warnings
+
+
+def test_map_refuses_a_limit_before_anything_is_measured_and_keeps_the_one_that_it_names():
+    heard = []
+    with pytest.raises(InputError, match="more than max_memory_mb=100; raise it") as refused:
+        sfm_shapefit.map_database(RING, max_memory_mb=100, progress=lambda stage, *_: heard.append(stage))
+    assert set(heard) == {"read"}
+    needed = int(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
+    found = sfm_shapefit.map_database(RING, max_memory_mb=needed + 30)  # the graph takes a few megabytes
+    assert found.models[0].kept.all()
+
+
+def test_an_adjustment_on_few_tracks_takes_what_is_forecast():
+    problem = disturb(make_wall((20, 30)), np.random.default_rng(1), center=0.01, point=0.01)
+    layout = lay_out(problem, AdjustmentOptions())
+    observed, entries = problem.num_observations, analyze(600, layout.pairs).num_bytes(1, np.uint8)
+    # As many keypoints as observations, and pairs and blocks of a factor so many that as many are forecast.
+    nothing = Workload(num_images=600, num_keypoints=0, num_pairs=0, num_matches=0, num_edges=0, num_nodes=0)
+    nothing = replace(nothing, averages=True)
+    counts = {"num_keypoints": observed, "num_matches": 2 * observed}
+    work = replace(nothing, **counts, num_pairs=len(layout.pairs) // 2, factor_entries=entries // 2)
+    full, empty = (forecast(one).memory_mb["adjusting a first placement"] for one in (work, nothing))
+    tracemalloc.start()
+    adjust(problem, max_iterations=2, linear_solver="sparse", threads=1)
+    taken_mb = tracemalloc.get_traced_memory()[1] / 1e6
+    tracemalloc.stop()
+    # What is forecast of an observation allows for two fifths more entries than there are, and for points.
+    assert 0.7 * taken_mb < full - empty < 1.3 * taken_mb
 
 
 @pytest.mark.parametrize("kind", ["plain", "rigs"])

@@ -230,11 +230,9 @@ def test_a_file_that_cannot_serve_is_refused_by_its_line(ring, tmp_path, lines, 
 
 def test_bars_and_ends_with_blanks_are_told_apart(ring, tmp_path):
     views = (("0001.jpg", 100), ("0002.jpg", 110))
-    for bar, ends in (("a", ("b c", "d")), ("a b", ("c", "d"))):
-        rows = [
-            "\t".join(("2", "0.001", str(x), "100", image, bar, end)) for end in ends for image, x in views
-        ]
-        (tmp_path / "bars.txt").open("a").write("\n".join([*rows, ""]))
+    ends = (("a", "b c"), ("a", "d"), ("a b", "c"), ("a b", "d"))
+    rows = ["\t".join(("2", "0.001", str(x), "100", image, *end)) for end in ends for image, x in views]
+    (tmp_path / "bars.txt").write_text("\n".join(rows))
     known = read_scale_bars(tmp_path / "bars.txt", read_model(ring).images)
     assert known.bars == ("a", "a b")
     assert known.points.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]

@@ -13,9 +13,8 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg, mean_rotation_l1, normalized
 from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.pipeline.components import refine_with_gravity
 from sfm_shapefit.rotations.average import average_relative_rotations
-from sfm_shapefit.rotations.gravity import DOWN, down_of, judge_gravity
+from sfm_shapefit.rotations.gravity import DOWN, down_of, judge_gravity, refine_with_gravity
 from sfm_shapefit.scene.given import Gravity
 from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
 from tests.scenes import BUNDLED, RING, read_from
