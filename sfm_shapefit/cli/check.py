@@ -154,7 +154,7 @@ def _be_strict(*, is_usable: bool, has_matches: bool) -> None:
     """End with exit code 4 unless a model can be used, and was compared with matches."""
     if is_usable and not has_matches:
         raise UnsolvableError(
-            "--strict: nothing but the model's own tracks was asked, and these cannot show a fold; give its "
+            "--strict: the model was checked by its own tracks alone, which cannot show a fold; give its "
             "database (--database) or its photographs (--images)"
         )
     if not is_usable:
@@ -165,7 +165,7 @@ def _refuse_of_many(given: dict[str, Path | None]) -> None:
     """Raise InputError for flags that are of one model, where a folder of several is judged."""
     for flag, path in given.items():
         if path is not None:
-            raise InputError(f"{flag} is of one model; give one of the folder's, or leave it out")
+            raise InputError(f"{flag} needs a single model; give one of those in the folder, or leave it out")
 
 
 def _refuse_without_use(

@@ -193,7 +193,8 @@ class GroupedCommand(TyperCommand):
         try:
             extra = super().parse_args(ctx, _gather_values(args))
         except typer.BadParameter as error:
-            error.message = error.message.removeprefix("Value error, ")  # typer has it from pydantic
+            said = error.message.removeprefix("Value error, ")  # typer has it from pydantic
+            error.message = said.replace("Input should be", "must be").partition(", unable to parse")[0]
             raise
         if extra and "--database" in known and not ctx.resilient_parsing:
             _refuse_extra(ctx, extra)

@@ -309,7 +309,7 @@ def _how_to_keep(num_not_trusted: int) -> str:
     """Say how to keep images that are left out; empty if there are none."""
     count = counted(num_not_trusted, "image")
     return (
-        f"{count} of these; min_trust=0 keeps {'them' if num_not_trusted > 1 else 'it'}"
+        f"{count} of those above; min_trust=0 keeps {'them' if num_not_trusted > 1 else 'it'}"
         if num_not_trusted
         else ""
     )

@@ -148,10 +148,9 @@ class Piece(Record):
     @property
     def statement(self) -> str:
         """Where it stands, in words."""
-        return (
-            f"{self.folder}: {self.num_placed} of {counted(self.num_cameras, 'camera')}, hinged at "
-            f"{', '.join(self.hinges) or 'nothing'}, with a scale of its own"
-        )
+        hinged = f", hinged at {', '.join(self.hinges)}" if self.hinges else ""
+        cameras = f"{self.num_placed} of {counted(self.num_cameras, 'camera')}"
+        return f"{self.folder}: {cameras}{hinged}, with a scale of its own"
 
 
 def folder_of(piece: int) -> str:

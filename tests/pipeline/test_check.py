@@ -192,7 +192,7 @@ def test_a_model_that_nothing_speaks_for_does_not_pass_strict(tmp_path):
     assert "verdict: cannot be judged: it has no 3D points, and no database was given or found" in judged
     tracks = run("check", shutil.copytree(model, tmp_path / "tracks"), "--strict", code=4)
     assert tracks.stdout.splitlines()[2] == "verdict: good"
-    assert "own tracks was asked, and these cannot show a fold" in " ".join(tracks.stderr.split())
+    assert "by its own tracks alone, which cannot show a fold" in " ".join(tracks.stderr.split())
     run("check", model, "--strict", "--no-second-opinion", "-q", code=0)
     strangers = spoiled(tmp_path / "strangers", names="other-{}".format)
     database = ("--database", RING / "database.db")
