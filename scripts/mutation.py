@@ -10,8 +10,7 @@ and of each place one mutant. Types, docstrings, imports and decorators are left
 A fresh compilation of the kernels for each mutant would take days. So the kernels of the group run as plain
 Python, under those of the group's tests that are quick enough for it; all others stay compiled. Each mutant
 has a process of its own, in which the changed source is loaded in place of the file's, and the tests run,
-the shortest first, until one fails. A mutant that takes far more processor time than the tests counts as
-found.
+the shortest first, until one fails. A mutant that takes far longer than the tests counts as found.
 
 Outcomes are kept in FOLDER and not asked again; give another folder after a change of the code.
 """
@@ -77,6 +76,8 @@ BUDGET_S = 30.0
 """Of tests per mutant, by their time in the first run."""
 PATIENCE, LOADING_S = 3, 30
 """A mutant is endless after so many times the tests' own time, and the seconds that loading may take."""
+WAITING = 4
+"""Or after so many times that by the clock: where threads wait for one another no processor time passes."""
 OPTIONS = ("-s", "-p", "no:cacheprovider", "-o", "addopts=", "--tb=native", "-W", "ignore")
 PROFILE = "mutation"
 """Of Hypothesis; the option of pytest outdoes the profile that `tests/conftest.py` loads."""
@@ -331,7 +332,8 @@ def main() -> None:
 
     def ask(path: str, source: str) -> str:
         run = (first_failure, group, path, source, tests)
-        return str(call(*run, environment=one_thread, cpu_limit_s=limit_s))
+        limits = {"cpu_limit_s": limit_s, "timeout_s": WAITING * limit_s}
+        return str(call(*run, environment=one_thread, **limits))
 
     unchanged = files_of(group)[-1]
     if by := ask(unchanged, (PACKAGE / unchanged).read_text()):

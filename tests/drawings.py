@@ -5,11 +5,12 @@ from dataclasses import fields, replace
 import numpy as np
 
 from sfm_shapefit.facts.model import ModelFacts, ModelInputs
-from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece
+from sfm_shapefit.facts.placed import Delivered, KeyFigures, LooseGroup, Piece
 from sfm_shapefit.facts.tables import CameraRow, MethodScores, PairRow, Table
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
 from sfm_shapefit.judgement.support import EvidenceShares
+from sfm_shapefit.refinement.starts import Finish
 from sfm_shapefit.report.drawing import Poses, build_drawing
 from sfm_shapefit.solver.solver_options import Solve
 

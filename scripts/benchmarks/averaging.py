@@ -118,10 +118,12 @@ def solve_oracle(problem: RotationProblem) -> FloatArray:
     measured = Rotation.from_matrix(right.rotations).as_quat()
     turns = Rotation.from_matrix(problem.rotations).as_quat()
     system = plan_system(n, pairs, np.ones(k), 1)
-    distances, blocks, gradient = np.empty(k), np.empty((k, 3, 3)), np.empty((n, 3))
+    distances, blocks, pulls = np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3))
     for _ in range(3):
-        weigh_blocks(pairs, measured, turns, information, np.inf, np.inf, distances, blocks, gradient)
-        turn_cameras(turns, system.solve_blocks(blocks, gradient, 1e-6), np.pi)
+        system.over_pairs(
+            weigh_blocks, pairs, measured, turns, information, np.inf, np.inf, distances, blocks, pulls
+        )
+        turn_cameras(turns, system.solve_blocks(blocks, system.gradient_of(pulls), 1e-6), np.pi)
     return np.asarray(Rotation.from_quat(turns).as_matrix())
 
 

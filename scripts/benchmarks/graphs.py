@@ -160,7 +160,7 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     run = time_call(lambda: sfm_shapefit.place(measured))
     placement = run.found
     rows, count = placement.cameras, len(placement.cameras)
-    truth, lud = one.truth[rows], placement.refined.lud
+    truth, lud = one.truth[rows], placement.refined.finish.lud
     kept = placement.assessment.trust[:count] >= _MIN_TRUST
     aligned = fit_similarity(placement.locations[kept], truth[kept], rotate=False)
     distances = np.linalg.norm(aligned.apply(placement.locations[kept]) - truth[kept], axis=1)

@@ -100,7 +100,7 @@ def _solve_shapefit(graph: ViewGraph) -> tuple[FloatArray, str]:
 def _place(graph: ViewGraph) -> tuple[FloatArray, str]:
     found = sfm_shapefit.place(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
     points = dict(zip(found.cameras.tolist(), found.locations, strict=True))
-    return _gather(points, graph.num_nodes), f"from {found.refined.start}, verdicts included"
+    return _gather(points, graph.num_nodes), f"from {found.refined.finish.start}, verdicts included"
 
 
 def _by_pytheia(nonlinear: bool, graph: ViewGraph) -> Solver:

@@ -28,7 +28,7 @@ from sfm_shapefit.adjustment.priors import add_priors
 from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
 from sfm_shapefit.adjustment.residuals import NormalEquations, Values, linearize
 from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points, invert_points, step_points
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray, distinct
 from sfm_shapefit.base.executors import Crew
 from sfm_shapefit.laplacian.operators import Workers, group_by
 
@@ -55,7 +55,6 @@ class _Share(NamedTuple):
     nodes: IntArray
 
     def of(self, values: Values) -> Values:
-        """Return the values that the part is about."""
         return Values(
             rotations=values.rotations[self.frames],
             centers=values.centers[self.frames],
@@ -134,7 +133,7 @@ class Parts:
         count = len(nodes.active)
         found = zip(self._crew.stream(_pairs_of, self._parts), self._shares, strict=True)
         keys = [share.nodes[pairs] @ np.array([count, 1]) for pairs, share in found]
-        every = np.unique(np.concatenate(keys))
+        every = distinct(np.concatenate(keys))
         none = np.zeros(problem.num_points, dtype=np.bool_)
         bare = lay_out(problem.of_points(none), options, nodes)
         pairs = np.stack(np.divmod(every, count), axis=1)
@@ -237,7 +236,7 @@ def _part_of(
     lenses, lens_of = np.unique(problem.lens_of_camera[cameras], return_inverse=True)
     sensors = rig.free_sensor_of_camera[cameras]
     of_frame, of_lens = nodes.node_of_frame[frames], nodes.node_of_lens[lenses]
-    seeing = np.unique([*of_frame, *of_lens, *nodes.node_of_sensor[sensors[sensors >= 0]]]).astype(np.int64)
+    seeing = distinct(np.concatenate([of_frame, of_lens, nodes.node_of_sensor[sensors[sensors >= 0]]]))
     seeing = seeing[seeing >= 0]
     number = np.full(len(nodes.active) + 1, -1)  # the last of which is that of none
     number[seeing] = np.arange(len(seeing))

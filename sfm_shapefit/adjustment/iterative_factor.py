@@ -67,12 +67,10 @@ class _Part:
 
     @classmethod
     def of_block(cls, num_nodes: int, edges: IntArray, size: int) -> "_Part":
-        """Return the system of a block of nodes of so many slots."""
         return cls(edges, _RIDGES_OF_BLOCKS, allocate_factor(analyze(num_nodes, edges), size, np.float32))
 
     @classmethod
     def of_groups(cls, num_groups: int, edges: IntArray) -> "_Part":
-        """Return the system of all groups."""
         return cls(edges, _RIDGES_OF_COARSE, allocate_factor(analyze(num_groups, edges), _SIMILARITY))
 
     def refactor(self, diagonal: FloatArray, off_diagonal: FloatArray) -> None:
@@ -116,7 +114,6 @@ class _CoarseSpace:
         )
 
     def refactor(self, system: ReducedSystem, pair_nodes: IntArray) -> None:
-        """Factor Z^T S Z."""
         count, edges = len(self.bases), self.part.edges
         first = np.searchsorted(edges[:, 0], np.arange(count + 1))
         diagonal = np.zeros((count, _SIMILARITY, _SIMILARITY))
@@ -149,7 +146,6 @@ class _Block:
         self.solution = np.zeros((0, size))
 
     def refactor(self, system: ReducedSystem) -> None:
-        """Factor its part of the system."""
         b = self.size
         self.part.refactor(system.diagonal[self.nodes, :b, :b], system.pairs[self.rows, :b, :b])
 

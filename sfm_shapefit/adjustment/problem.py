@@ -23,7 +23,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray, distinct
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.lens import NUM_VALUES, Lens
@@ -236,7 +236,7 @@ class AdjustmentProblem:
             frames, centers, information = self.center_prior
             k = len(frames)
             _check_range(frames, n, "frame of the center prior's")
-            if len(np.unique(frames)) < k or centers.shape != (k, 3) or not np.isfinite(centers).all():
+            if len(distinct(frames)) < k or centers.shape != (k, 3) or not np.isfinite(centers).all():
                 raise InputError(f"the center prior must have {k} finite centers, each of its own frame")
             _check_information(information, k, "center")
         if self.lens_prior is not None:

@@ -93,7 +93,6 @@ def choose_solver(
 
 
 def _is_dense(layout: Layout, options: AdjustmentOptions) -> bool:
-    """Return whether a factor is dense."""
     most = {"auto": _DENSE_LIMIT, "dense": np.inf}.get(options.linear_solver, 0)
     return layout.num_unknowns <= most
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.adjustment.place_errors import Distances, ScaleErrors
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.scene.given import ScaleBars
 
 MOST_SIGMAS = 4.0
@@ -105,6 +105,6 @@ def pooled_noise(errors_px: FloatArray, points: IntArray, noise_px: float) -> fl
 
     They are few: as many degrees of freedom as one point in three images leaves speak for that of keypoints.
     """
-    freedom = 2.0 * len(points) - 3.0 * len(np.unique(points))
+    freedom = 2.0 * len(points) - 3.0 * len(distinct(points))
     noise_px = noise_px if np.isfinite(noise_px) else 0.5
     return float(np.sqrt((np.sum(errors_px**2) + 3.0 * noise_px**2) / (freedom + 3.0)))

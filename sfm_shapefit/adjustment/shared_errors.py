@@ -50,7 +50,7 @@ from sfm_shapefit.adjustment.projection import (
 )
 from sfm_shapefit.adjustment.residuals import chunks_of, kernel_inputs
 from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, quantile
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import METRIC_SIGMA
 from sfm_shapefit.base.jit import inner_kernel, kernel
@@ -322,7 +322,7 @@ def _group_neighbors(points: FloatArray) -> IntArray:
     while 2 * count <= _MOST_GROUPS and len(points) >= 2 * count * _FEWEST_OF_A_GROUP:
         for group in range(count):
             own = np.flatnonzero(groups == group)
-            low, high = np.percentile(points[own], [10.0, 90.0], axis=0)
+            low, high = quantile(points[own], 0.1), quantile(points[own], 0.9)
             order = np.argsort(points[own, int(np.argmax(high - low))], kind="stable")
             groups[own[order[len(order) // 2 :]]] = group + count
         count *= 2

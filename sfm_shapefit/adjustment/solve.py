@@ -262,11 +262,9 @@ class _Run:
         self.gradient_norm, self.iterations = math.inf, 0
 
     def lay_out(self) -> Layout:
-        """Return the structure."""
         return lay_out(self.problem, self.options)
 
     def choose_solver(self) -> ReducedFactor:
-        """Return what systems are solved with."""
         return choose_solver(self.problem, self.layout, self.options, self.workers)
 
     @property
@@ -284,7 +282,6 @@ class _Run:
         return sum_priors(self.problem, values, self.options.noise_px)
 
     def iterate(self) -> Ending:
-        """Take steps until a reason to stop."""
         while True:
             self.linearize()
             exact = 0.5 * self.problem.num_observations * _EXACT_PX**2
@@ -316,7 +313,6 @@ class _Run:
         del self.normal
 
     def equations(self) -> NormalEquations:
-        """Return the normal equations at the best values."""
         given = self.problem, self.layout, self.values, self.options, self.workers
         return linearize_all(*given, self.least_curvature)
 
@@ -345,6 +341,15 @@ class _Run:
 
     def propose(self, damping: float) -> tuple[Values, float, float] | None:
         """Return the values after a damped step, the decrease predicted, and the cost; None without one."""
+        stepped = self.step(damping)
+        if stepped is None:
+            return None
+        values, cost, (damped, slope) = stepped
+        predicted = float(0.5 * (damping * damped - slope))
+        return (values, predicted, cost) if math.isfinite(predicted) else None
+
+    def step(self, damping: float) -> tuple[Values, float, tuple[float, float]] | None:
+        """Return values, their cost, and the step's square by curvatures and slope; None without a step."""
         layout, normal = self.layout, self.normal
         is_large = len(normal.entries) > MANY_ENTRIES
         system = eliminate_points(layout, normal, damping, self.workers)
@@ -362,12 +367,10 @@ class _Run:
         diagonal = np.einsum("naa->na", normal.nodes)
         damped = float(np.sum(diagonal * steps**2) + np.sum(normal.points[:, [0, 3, 5]] * point_steps**2))
         slope = float(np.sum(normal.node_gradients * steps) + np.sum(normal.point_gradients * point_steps))
-        predicted = 0.5 * (damping * damped - slope)
         values = move(layout, self.values, steps, point_steps)
-        if values is None or not math.isfinite(predicted):
+        if values is None:
             return None
-        values, cost = self.settle(values, int(self.options.settles_points))
-        return values, predicted, cost
+        return *self.settle(values, int(self.options.settles_points)), (damped, slope)
 
     def solve(self, system: ReducedSystem) -> FloatArray | None:
         """Return the steps of the nodes (N, 6); None if the system has no solution."""
@@ -391,16 +394,13 @@ class _DividedRun(_Run):
         return self.parts.layout
 
     def choose_solver(self) -> ReducedFactor:
-        """Return what systems are solved with."""
         return choose_solver(self.problem, self.layout, self.options, self.workers, is_divided=True)
 
     def settle(self, values: Values, steps: int) -> tuple[Values, float]:
-        """Return values whose points have taken some steps by themselves, and the cost of all at these."""
         points, cost = self.parts.settle(values, self.how(self.damping), steps)
         return replace(values, points=points), cost + self.cost_of_priors(values)
 
     def how(self, damping: float) -> Pass:
-        """Return how parts are linearized now."""
         return Pass(self.options.loss_scale_px, self.least_curvature, damping, self.crew.threads_of_task)
 
     def linearize(self) -> None:
@@ -410,11 +410,9 @@ class _DividedRun(_Run):
         self.note_gradient(self.total.largest, largest_share(self.total.curvatures, self.total.gradients))
 
     def forget(self) -> None:
-        """Give up the equations."""
         del self.total
 
-    def propose(self, damping: float) -> tuple[Values, float, float] | None:
-        """Return the values after a damped step, the decrease predicted, and the cost; None without one."""
+    def step(self, damping: float) -> tuple[Values, float, tuple[float, float]] | None:
         if self.made.damping != damping:  # after a step that was refused
             self.made = self.made._replace(damping=damping)
             self.total = self.parts.linearize(self.values, self.made)
@@ -429,10 +427,7 @@ class _DividedRun(_Run):
         points, cost, (damped, slope) = self.parts.step(self.values, moved, steps, self.made, settling)
         damped += np.sum(total.curvatures * steps**2)
         slope += np.sum(total.gradients * steps)
-        predicted = float(0.5 * (damping * damped - slope))
-        if not math.isfinite(predicted):
-            return None
-        return replace(moved, points=points), predicted, cost + self.cost_of_priors(moved)
+        return replace(moved, points=points), cost + self.cost_of_priors(moved), (damped, slope)
 
 
 def move(layout: Layout, values: Values, steps: FloatArray, point_steps: FloatArray) -> Values | None:

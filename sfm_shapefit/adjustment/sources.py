@@ -8,7 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.adjustment.views import CUBE, views_of
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from sfm_shapefit.base.arrays import (
+    BoolArray,
+    FloatArray,
+    Int32Array,
+    IntArray,
+    distinct,
+    stable_order,
+)
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.lists import offsets_of
@@ -81,9 +88,9 @@ def collect_matches(
 
 def collect_tracks(images: Images, pictures: KeypointRays, points: Points) -> ObservedTracks:
     """Return the tracks of points that posed images observe; they keep the points' ids and order."""
-    order = np.argsort(points.images, kind="stable")
+    order = stable_order(points.images)
     cameras, pixels, on_plane = _look_up(images, pictures, points.images[order], points.keypoints[order])
-    back = np.argsort(points.points_seen()[order], kind="stable")
+    back = stable_order(points.points_seen()[order])
     return ObservedTracks(
         offsets=points.offsets,
         cameras=cameras[back],
@@ -100,7 +107,7 @@ def links_touching(images: Images, links: Links, chosen: BoolArray) -> Links:
     own = chosen[views_of(images).images[links.cameras]]
     if isinstance(links, ObservedTracks):
         track_of = links.list_of_rows()
-        return links.subset(np.unique(track_of[own]))
+        return links.subset(distinct(track_of[own]))
     joined = connected_components(len(own), links.matches.astype(np.int64))
     touched = np.zeros(len(own), dtype=np.bool_)
     touched[joined[own]] = True

@@ -88,7 +88,7 @@ def triangulate(
         chosen, is_left = np.flatnonzero(sizes >= fewest), np.ones_like(partners, dtype=np.bool_)
         done = 0
         for own in map(joined.subset, _blocks(chosen)):
-            tracks = matched.observed(own)
+            tracks = matched.observed(own, threads)
             found = triangulate_tracks(tracks, poses, limits, threads)
             parts.append(views.seen_points(tracks, found))
             is_left[own.rows[found.points_seen >= 0]] = False

@@ -1,14 +1,16 @@
 """Work shared out among threads, or among the workers of a cluster; answers come in order."""
 
-from asyncio import CancelledError
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
+
+from sfm_shapefit.base.arrays import AnyArray, IntArray
 from sfm_shapefit.base.errors import ShapeFitError
 
 Advance = Callable[[int, int], None]
@@ -42,16 +44,34 @@ def in_ranges(threads: int, count: int, work: Callable[..., object], *given: obj
         pass
 
 
-def made_ahead(threads: int, items: Iterator[Answer]) -> Iterator[Answer]:
-    """Yield items, the next of which another thread makes meanwhile; a single thread is the caller's."""
+def gathered(threads: int, array: AnyArray, rows: IntArray) -> AnyArray:
+    """Return array[rows]; threads share the rows."""
+    found: AnyArray = np.empty_like(array, shape=(len(rows), *array.shape[1:]))
+
+    def gather(begin: int, end: int) -> None:
+        found[begin:end] = array[rows[begin:end]]
+
+    in_ranges(threads, len(rows), gather)
+    return found
+
+
+def overlapped(threads: int, work: Callable[[Task], Answer], tasks: Iterable[Task]) -> Iterator[Answer]:
+    """Yield what `work`, which shares itself out among threads, makes of each task, in their order.
+
+    What of one task no thread can share is done beside the next task, of which the caller's thread makes and
+    others work on no more than one ahead. A single thread is the caller's.
+    """
     if threads <= 1:
-        yield from items
+        yield from map(work, tasks)
         return
-    with ThreadPoolExecutor(1) as pool:
-        following = pool.submit(next, items, None)
-        while (item := following.result()) is not None:
-            following = pool.submit(next, items, None)
-            yield item
+    with ThreadPoolExecutor(2) as pool:
+        waiting: deque[Future[Answer]] = deque()
+        for task in tasks:
+            waiting.append(pool.submit(work, task))
+            if len(waiting) == 2:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 class WorkerError(ShapeFitError):
@@ -139,6 +159,8 @@ def _answer(future: Any) -> Any:
 @contextmanager
 def _failures_told() -> Iterator[None]:
     """Raise what a cluster raises in one sentence; what the work itself says passes as it is."""
+    from asyncio import CancelledError  # which a run without a cluster has no use for, and loads for long
+
     try:
         yield
     except ShapeFitError:

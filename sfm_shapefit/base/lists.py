@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import AnyArray, IndexArray, IntArray
+from sfm_shapefit.base.arrays import AnyArray, IndexArray, IntArray, stable_order
 
 
 def offsets_of(lengths: npt.ArrayLike) -> IntArray:
@@ -68,7 +68,7 @@ class RowLists(Lists):
 
         Rows whose label is negative are in none.
         """
-        rows = np.argsort(labels, kind="stable")[np.sum(labels < 0) :]
+        rows = stable_order(labels)[np.sum(labels < 0) :]
         return cls(offsets_of(np.bincount(labels[rows], minlength=count)), rows)
 
     def __iter__(self) -> Iterator[IntArray]:

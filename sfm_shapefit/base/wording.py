@@ -59,9 +59,9 @@ def counted_are(number: int, noun: str) -> str:
     return f"{counted(number, noun)} {'is' if number == 1 else 'are'}"
 
 
-def are(names: Sequence[str], what: str = "camera") -> str:
+def are(names: Sequence[str]) -> str:
     """Return the number of cameras, the names of the first, and is for one, else are."""
-    return f"{counted(len(names), what)} ({first_of(names)}) {'is' if len(names) == 1 else 'are'}"
+    return f"{counted(len(names), 'camera')} ({first_of(names)}) {'is' if len(names) == 1 else 'are'}"
 
 
 def rounded(value: float, smallest: float = 1e-9, digits: int = 4) -> str:

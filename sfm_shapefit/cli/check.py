@@ -104,7 +104,6 @@ def check_command(
         refuse_no_model(source)
         from sfm_shapefit.base.atomic_folder import claimed_output
         from sfm_shapefit.commands.check import check
-        from sfm_shapefit.commands.lengths import judge_bars
         from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.files.output_paths import refuse_file
@@ -120,7 +119,11 @@ def check_command(
                 read_source(source, database)  # what is wrong with that is said first
             refuse_file(report, overwrite=overwrite, protect=inputs)
         plan = () if known is None or no_second_opinion else PLANS["MODEL with a database"]
-        bars = None if scale_bars is None else judge_bars(source, scale_bars)
+        bars = None
+        if scale_bars is not None:
+            from sfm_shapefit.commands.lengths import judge_bars
+
+            bars = judge_bars(source, scale_bars)
         with (
             claimed_output(second_opinion, overwrite=overwrite, protect=inputs)
             if second_opinion

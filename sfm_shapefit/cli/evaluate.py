@@ -124,7 +124,6 @@ def evaluate_command(
 
 
 def _tell_lengths(source: Path, lengths: list[str], bars: Path | None, *, as_json: bool) -> None:
-    """Print how well lengths of a model are known."""
     with report_errors():
         from sfm_shapefit.base.paths import refuse_absent
         from sfm_shapefit.commands.lengths import evaluate_lengths

@@ -12,6 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from sfm_shapefit import __version__
+from sfm_shapefit.base.libraries import load_ahead
 from sfm_shapefit.cli.colmap_names import answer_for_command
 from sfm_shapefit.cli.console import (
     EXIT_INTERRUPTED,
@@ -29,6 +30,9 @@ _GROUPS = {
     "Set up": ("warm-up",),
 }
 """The commands in the help, the most used first."""
+
+_READING = ("map", "locate", "join", "check")
+"""Commands that load pycolmap, whatever they are given."""
 
 # New objects after which unused ones are looked for. Modules make a hundred thousand that stay; to go through
 # them as often as the interpreter does by itself takes a twentieth of a short run.
@@ -85,7 +89,6 @@ class _ByImportance(TyperGroup):
         return known + [name for name in super().list_commands(ctx) if name not in known]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a section for each group."""
         known = self.list_commands(ctx)
         for title, names in _GROUPS.items():
             shown = [(name, self.commands[name].get_short_help_str(100)) for name in names if name in known]
@@ -126,6 +129,8 @@ def load_commands(words: Sequence[str] = ()) -> None:
     """
     known = [name for names in _GROUPS.values() for name in names]
     called = next((word for word in words if not word.startswith("-")), None)
+    if called in _READING and not {"-h", "--help"}.intersection(words):
+        load_ahead("pycolmap", "_core")  # a tenth of what all imports take, on another core
     for name in [called] if called in known else known:
         import_module(f"sfm_shapefit.cli.{name.replace('-', '_')}")
 

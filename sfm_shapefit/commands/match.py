@@ -118,7 +118,6 @@ def _remember(database: Path, options: MatchingOptions) -> None:
 
 
 def _pairing_of(names: list[str], options: MatchingOptions) -> str:
-    """Return which pairs are matched."""
     if options.pairing != "auto":
         return options.pairing
     if len(names) <= MOST_EXHAUSTIVE:

@@ -8,6 +8,7 @@ from typing import Annotated, Self
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import distinct
 from sfm_shapefit.base.display import Displayed, NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
@@ -89,7 +90,6 @@ class CheckedPieces(Record, Displayed, repr=False):
 
 
 def _choose_kept(pieces: Sequence[CheckedPiece], images: Mapping[str, Images]) -> Iterator[str]:
-    """Yield the folders of the models to keep."""
     usable = [p for p in pieces if p.facts and p.facts.verdict.grade in (Grade.GOOD, Grade.LOOK)]
     taken = set[str]()
     for one in sorted(usable, key=lambda one: -images[one.folder].num_images):
@@ -105,7 +105,7 @@ def _compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
     widths = np.concatenate([one.focal_widths for one in images.values()])
     model = np.repeat(np.arange(len(images)), [one.num_images for one in images.values()])
     for rows, _ in find_sequences(names):
-        members = np.unique(model[rows])
+        members = distinct(model[rows])
         typical = np.array([np.median(widths[rows][model[rows] == k]) for k in members])
         if np.ptp(np.log(typical)) > LOCAL_SHARE:
             least, most = (Path([*images][members[k]]).name for k in (typical.argmin(), typical.argmax()))
@@ -117,7 +117,6 @@ def _compare_lenses(images: Mapping[str, Images]) -> Iterator[str]:
 
 
 def _shared_images(images: Mapping[str, Images]) -> Iterator[str]:
-    """Yield which models have images in common."""
     for (one, mine), (other, others) in combinations(images.items(), 2):
         if common := len(set(mine.names) & set(others.names)):
             both = f"{Path(one).name} and {Path(other).name} have {counted(common, 'image')} in common"

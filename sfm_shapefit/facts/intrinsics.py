@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, quantile
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import first_of, label_lens
 from sfm_shapefit.scene.images import Images
@@ -161,7 +161,7 @@ def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
     held = len(rows) - len(changes) - unknown
     parts = [f"{len(changes)} of {len(rows)} cameras in doubt have another focal length now"]
     if changes:
-        low, middle, high = np.quantile(changes, [0.0, 0.5, 1.0])
+        low, middle, high = (quantile(np.array(changes), share) for share in (0.0, 0.5, 1.0))
         parts = [
             f"{parts[0]}, by {low:+.1%} to {high:+.1%} (median {middle:+.1%}), "
             f"most that of {max(found, key=lambda row: abs(row.change)).label}"

@@ -13,7 +13,7 @@ from sfm_shapefit.adjustment.place_errors import (
     draws_at,
     errors_of_points,
 )
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import rounded
@@ -173,7 +173,7 @@ def tell_usual_length(places: PlaceErrors, scale: ScaleErrors, axes: Axes) -> Le
 def spread_rows(lengths: IntArray) -> IntArray:
     """Return rows of points (k,), spread evenly over those that as many images see as the median, or more."""
     usual = np.flatnonzero(lengths >= np.median(lengths)) if len(lengths) else lengths
-    return usual[np.unique(np.linspace(0, len(usual) - 1, min(len(usual), _MOST_PLACES)).astype(np.int64))]
+    return usual[distinct(np.linspace(0, len(usual) - 1, min(len(usual), _MOST_PLACES)).astype(np.int64))]
 
 
 def length_between(

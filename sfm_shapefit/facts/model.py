@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import BundleAdjustment, Estimate
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, distinct
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, in_pixels, rounded
@@ -141,8 +141,8 @@ class GroupFacts(Record):
         cameras = placement.groups.group_of[: placement.num_cameras]
         pairs = placement.graph.edges[: placement.num_pairs]
         return cls(
-            num_groups=len(np.unique(cameras)),
-            num_placed=len(np.unique(cameras[placement.cameras[kept]])),
+            num_groups=len(distinct(cameras)),
+            num_placed=len(distinct(cameras[placement.cameras[kept]])),
             num_fixed=0 if fixed is None else int(np.sum(fixed)),
             num_inner_pairs=int(np.sum(~placement.groups.joins(pairs))),
         )

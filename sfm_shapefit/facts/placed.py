@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 
 from sfm_shapefit import __version__
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray, quantile
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.geometry import extent_of, fit_similarity_l1, median_spread
 from sfm_shapefit.base.record import Record
@@ -24,9 +24,9 @@ from sfm_shapefit.facts.tables import CameraRow, Table
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.placement.place import Placement, count_large
-from sfm_shapefit.refinement.starts import RefinedPlacement
+from sfm_shapefit.placement.right_pairs import TakenForRight
+from sfm_shapefit.refinement.starts import Finish
 from sfm_shapefit.solver.solver_options import Solve, Status
-from sfm_shapefit.solver.splitting.lud import Lud
 
 UNITS = {
     "input": "of the input's units",
@@ -201,8 +201,8 @@ class Delivered(Record):
 
         The last step was a bundle adjustment, if `adjusted`.
         """
-        solved, refined = placement.certified, placement.refined
-        delivered = f"{refined.start}, refined in angles" if refined.is_refined else refined.start
+        solved, finish = placement.certified, placement.refined.finish
+        delivered = f"{finish.start}, refined in angles" if finish.refined else finish.start
         delivered += ", then adjusted" if adjusted else ""
         to = f"to {max(solved.gap, 0.0):.1e}"
         certified = f"ShapeFit's optimum is certified {to}{_OTHERS[solved.unique]}"
@@ -220,47 +220,6 @@ class Delivered(Record):
             statement=f"{certified}; delivered: {apart}",
             from_certified_median=median,
             from_certified_max=largest,
-        )
-
-
-class Finish(Record):
-    """From the certified optimum to the centers."""
-
-    start: Annotated[str, "The convex start that was kept."]
-    refined: Annotated[bool, "Whether the angular refinement moved the start."]
-    reason: Annotated[str, "Why this start was kept."]
-    disagreement: Annotated[float | None, "How far the two starts disagree about lengths, as a share."]
-    costs: Annotated[dict[str, float], "Robust angular cost of each start after refinement."]
-    levels_deg: Annotated[tuple[float, ...], "Level of the residuals, of pairs and of directions to points."]
-    moved_median: Annotated[
-        float,
-        "Median move of cameras and points from the start that is kept, as a share of their median distance "
-        "from the center.",
-    ]
-    moved_max: Annotated[float, "The largest such move."]
-    num_turned_pairs: Annotated[
-        int,
-        "Directions, those to points too, that fit the start and not the refined locations, or the other way "
-        "round.",
-    ]
-    num_put_back: Annotated[int, "Cameras that had left the scene and were put back."]
-    lud: Annotated[Lud | None, "The second start; null if it was not solved."]
-    reweighted: Annotated[
-        Solve | None,
-        "The program at the weights that are the pairs' posteriors, certified at these; null where the "
-        "cameras come from another start.",
-    ]
-
-    @classmethod
-    def of_placement(cls, refined: RefinedPlacement) -> Self:
-        """Return how the locations were found from the optimum."""
-        return cls.taken_from(
-            refined,
-            refined=refined.is_refined,
-            moved_median=refined.moved[0],
-            moved_max=refined.moved[1],
-            num_put_back=len(refined.reset_nodes),
-            reweighted=refined.reweighted and refined.reweighted.solved.facts,
         )
 
 
@@ -369,7 +328,7 @@ def facts_of_placement(
         ],
         "pieces": pieces_of(placement, solved),
         "solve": placement.certified.facts,
-        "finish": Finish.of_placement(placement.refined),
+        "finish": placement.refined.finish,
         "versions": {"sfm_shapefit": __version__} | {name: version(name) for name in others},
     }
 
@@ -393,7 +352,7 @@ def pair_error_deg(placement: Judged) -> float | None:
 def residuals_deg(placement: Judged) -> dict[str, float]:
     """Return quantiles of the placed pairs' residuals in degrees, and the shares that lie beyond angles."""
     residuals = placement.assessment.residuals_deg[placement.pairs]
-    facts = {f"quantile_{q}": float(np.quantile(residuals, q / 100.0)) for q in _QUANTILES}
+    facts = {f"quantile_{q}": float(quantile(residuals, q / 100.0)) for q in _QUANTILES}
     return facts | {f"share_beyond_{angle}": float(np.mean(residuals > angle)) for angle in _ANGLES_DEG}
 
 
@@ -407,18 +366,6 @@ class GraphInputs(InputFacts):
     def path(self) -> str:
         """Path of the graph."""
         return self.graph
-
-
-class TakenForRight(Record):
-    """What is certain if the pairs that the answer takes for right are right."""
-
-    statement: Annotated[str, "All of it in a sentence."]
-    num_right: Annotated[int, "Pairs of the largest piece whose posterior in pairs.csv is above one half."]
-    num_fixed: Annotated[int, "Nodes of the largest piece that these pairs alone make parallel rigid."]
-    rigid: Annotated[bool, "Whether these are all nodes that are placed."]
-    solve: Annotated[
-        Solve | None, "The certified program restricted to these pairs; null where they are not rigid."
-    ]
 
 
 class GraphFacts(PlacedFacts):

@@ -33,7 +33,6 @@ from sfm_shapefit.facts.placed import (
     Delivered,
     GraphFacts,
     GraphInputs,
-    TakenForRight,
     facts_of_placement,
 )
 from sfm_shapefit.facts.placed_graph import PlacedGraph
@@ -56,12 +55,13 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.gauge_options import KnownDistance
 from sfm_shapefit.placement.prior_fit import PriorFit
-from sfm_shapefit.placement.right_pairs import RightPairs, examine_right_pairs
+from sfm_shapefit.placement.right_pairs import TakenForRight, examine_right_pairs
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.sequences import Loop
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.solver.solver_options import SolverResult
 
 if TYPE_CHECKING:
@@ -84,6 +84,10 @@ class ModelInArrays(Protocol):
     @property
     def as_it_is(self) -> Any:
         """The reconstruction, which may have been changed, if it is made; else the model itself."""
+
+    @property
+    def structure(self) -> Structure:
+        """The points, and what they are seen with."""
 
     def colored(self, pictures: Any) -> tuple["ModelInArrays", tuple[str, ...]]:
         """Return the model with colors of pictures, and the names of those that cannot be read."""
@@ -128,9 +132,8 @@ class _Placed(Written, Tabled):
 
     @property
     def told(self: Any) -> Telling:
-        """What the terminal says."""
         left_out = reasons_by_place(self.not_placed, self.cameras.columns["name"].tolist())
-        told: Telling = self.facts.told(left_out, self.placement.refined.statement())
+        told: Telling = self.facts.told(left_out, self.placement.refined.finish.statement())
         return told
 
     @property
@@ -494,7 +497,6 @@ class GraphResult(_Placed):
         """What is told of the graph: each figure of locate.json, terminal and report."""
         placement = self.placement
         solved = [(p.piece, _SOLVER_SCALE, len(p.cameras)) for p in (placement, *self.further)]
-        right = self.right_pairs
         return GraphFacts.taken_from(
             self,
             **facts_of_placement(placement, self.cameras, solved, (math.nan, SOLVER_UNITS)),
@@ -503,17 +505,10 @@ class GraphResult(_Placed):
             warnings=list(self.warnings),
             inputs=GraphInputs(graph=str(self.path), directions=self.statement),
             dimension=placement.graph.dimension,
-            right_pairs=TakenForRight(
-                statement=right.statement(),
-                num_right=len(right.edges),
-                num_fixed=right.num_fixed,
-                rigid=right.is_rigid,
-                solve=None if right.solved is None else right.solved.facts,
-            ),
         )
 
     @cached_property
-    def right_pairs(self) -> RightPairs:
+    def right_pairs(self) -> TakenForRight:
         """The pairs of the largest piece that are taken for right, and the program restricted to them."""
         return examine_right_pairs(self.placement, self.options.solver)
 

@@ -157,13 +157,8 @@ def correlations_of(covariances: FloatArray) -> FloatArray:
     return np.asarray(np.clip(found, -1.0, 1.0))
 
 
-def pair_rows(
-    placement: Judged,
-    support: IntArray,
-    further: Sequence[Judged] = (),
-    more: Mapping[str, FloatArray] | None = None,
-) -> Table[PairRow]:
-    """Return one row per pair of cameras (m,), with its number of inlier matches, and `more` columns.
+def pair_rows(placement: Judged, support: IntArray, further: Sequence[Judged] = ()) -> Table[PairRow]:
+    """Return one row per pair of cameras (m,), with its number of inlier matches.
 
     Pairs of the `further` pieces that are solved are judged by these.
     """
@@ -192,7 +187,7 @@ def pair_rows(
         "reason": reasons,
     }
     columns |= zip(("residual_deg", "dual_norm", "leverage", "posterior"), figures, strict=True)
-    return Table(PairRow, graph.dimension, columns | dict(more or {}))
+    return Table(PairRow, graph.dimension, columns)
 
 
 def without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int, str]:

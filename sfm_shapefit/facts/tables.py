@@ -25,6 +25,7 @@ from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.judgement.limits import KNOWN_DEG
 from sfm_shapefit.judgement.reasons import ModelVerdict
 from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.scene.given import EarthDatum
 
 TableName = Literal["cameras", "pairs"]
@@ -202,6 +203,11 @@ def contradicting(pairs: Table[PairRow]) -> BoolArray:
     """Return which pairs (m,) say that their cameras stand elsewhere; by less than a degree they do not."""
     known_deg = pairs.columns["residual_deg"] < KNOWN_DEG
     return np.asarray((pairs.columns["verdict"] == Verdict.OUTLIER.value) & ~known_deg)
+
+
+def rejected(pairs: Table[PairRow]) -> BoolArray:
+    """Return which pairs (m,) have no direction because most of their matches contradict the rotations."""
+    return np.asarray(pairs.columns["reason"] == DirectionStatus.LOW_INLIER_RATIO.value)
 
 
 def read_trust(path: Path) -> dict[str, float]:

@@ -66,15 +66,15 @@ def quality_warnings(placement: Judged, options: PlacementOptions | None = None)
         yield f"the solve is not certified to the tolerance: {placement.certified.status.value}"
     if placement.certified.unique is False:
         yield "the certificate does not prove the optimum of the convex program unique"
-    refined, rejected = placement.refined, len(placement.rejected_pairs) / max(len(placement.pairs), 1)
+    finish, rejected = placement.refined.finish, len(placement.rejected_pairs) / max(len(placement.pairs), 1)
     contradicting = placement.num_contradicting / max(len(placement.pairs), 1)
     adjusted = placement.adjusted_covariances  # pixels tell lengths, whatever the starts had
     is_measured = adjusted is not None and not np.isnan(adjusted).any()
-    if refined.collapsed and not (is_measured or (refined.is_refined and rejected <= _FEW_REJECTED)):
-        assert refined.disagreement is not None
+    if finish.collapsed and not (is_measured or (finish.refined and rejected <= _FEW_REJECTED)):
+        assert finish.disagreement is not None
         yield (
-            f"two ways to find lengths disagree by {refined.disagreement:.0%}, as on long chains and with "
-            "many wrong pairs" + ("" if refined.is_refined else _how_to_refine(options))
+            f"two ways to find lengths disagree by {finish.disagreement:.0%}, as on long chains and with "
+            "many wrong pairs" + ("" if finish.refined else _how_to_refine(options))
         )
     yield from _uncertainty_warnings(placement)
     if contradicting > _ALARMING_SHARE:

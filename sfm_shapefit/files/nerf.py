@@ -115,7 +115,6 @@ class _Intrinsics(NamedTuple):
         return next((node for node in nodes if node.value is not None), None)
 
     def number(self, key: str, default: float = np.nan) -> float:
-        """Return a number."""
         node = self.node(key)
         return default if node is None else node.number()
 

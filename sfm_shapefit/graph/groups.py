@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen, sum_by
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, frozen, sum_by
 from sfm_shapefit.base.errors import InputError
 
 _COINCIDENT = 1e-12  # share of the largest offset; a smaller offset within a group is rounding
@@ -49,7 +49,7 @@ class RigidGroups:
             raise InputError(
                 f"the offset of node {int(np.argmin(np.isfinite(offsets).all(axis=1)))} is not finite"
             )
-        present = np.unique(labels)
+        present = distinct(labels)
         if not np.array_equal(present, np.arange(len(present))):
             raise InputError("groups must be numbered 0, 1, ... without gaps")
         object.__setattr__(self, "group_of", frozen(labels))
@@ -136,7 +136,7 @@ class RigidGroups:
         centered, units = self.center(), self.units
         moved = np.linalg.norm(centered.offsets, axis=1)
         sizes = np.ones(self.num_units)
-        for unit in np.unique(units[moved > 0.0]).tolist():
+        for unit in distinct(units[moved > 0.0]).tolist():
             sizes[unit] = np.sqrt(np.mean(moved[(moved > 0.0) & (units == unit)] ** 2))
         return replace(centered, offsets=centered.offsets / sizes[units][:, None])
 

@@ -9,7 +9,7 @@ from dataclasses import KW_ONLY, dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, real_numbers
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, real_numbers
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -95,7 +95,7 @@ class MeasuredGraph:
         """Whether a group has two nodes apart that others see; else the directions leave the scale open."""
         if self.groups is None:
             return False
-        nodes = np.unique(self.graph.edges[self.groups.joins(self.graph.edges)])
+        nodes = distinct(self.graph.edges[self.groups.joins(self.graph.edges)])
         return bool(len(nodes)) and self.groups.restricted_to(nodes).have_extent
 
     @property
@@ -112,7 +112,7 @@ class MeasuredGraph:
         which no node is left is fixed no more.
         """
         if len(rows) == self.graph.num_edges and np.array_equal(rows, np.arange(len(rows))):
-            graph, nodes = self.graph, np.unique(self.graph.edges)
+            graph, nodes = self.graph, distinct(self.graph.edges)
             if len(nodes) == graph.num_nodes:  # all of it, and samples of errors are large
                 return self, nodes
         graph, nodes = self.graph.restricted_to(rows)
@@ -137,7 +137,7 @@ class MeasuredGraph:
         """Return what is left of the edges `rows` and of the nodes, whose graph is given."""
         groups, fixed = self.groups, self.fixed_group
         if groups is not None and fixed is not None:
-            present = np.unique(groups.group_of[nodes])
+            present = distinct(groups.group_of[nodes])
             fixed = int(np.searchsorted(present, fixed)) if fixed in present else None
         return MeasuredGraph(
             graph,

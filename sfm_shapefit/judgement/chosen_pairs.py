@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct_pairs
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.scene.images import Images
@@ -97,7 +97,7 @@ def alike_pairs(descriptors: Sequence[IntArray], most: int) -> IntArray:
     if len(asked) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     pairs = _most_alike(_signatures([descriptors[k] for k in asked.tolist()]), most).pairs()
-    return asked[np.unique(np.sort(pairs, axis=1), axis=0)]
+    return asked[distinct_pairs(np.sort(pairs, axis=1))]
 
 
 class _Ranked(NamedTuple):

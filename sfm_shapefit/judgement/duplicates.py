@@ -15,6 +15,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, FEWEST_POINTS, LOCAL_SHARE, RIVAL_SHARE
 from sfm_shapefit.judgement.reasons import Kind
@@ -64,7 +65,6 @@ def _depths(images: Images, points: Points) -> FloatArray:
 def _find_duplicates(
     images: Images, pictures: KeypointRays, pairs: IntArray, view: View, threads: int
 ) -> IntArray:
-    """Return those of some pairs (k, 2) that are near duplicates."""
     found = [np.zeros((0, 2), dtype=np.int64)]
     for batch in view.links(chosen=is_among(view.pairs, pairs)) if len(pairs) else ():
         first, second = (_places(images, pictures, batch, side) for side in (0, 1))
@@ -76,12 +76,11 @@ def _find_duplicates(
 
 def _places(images: Images, pictures: KeypointRays, batch: KeypointMatches, side: int) -> FloatArray:
     """Return where the matches of pairs are in their first or second image, (M, 2), in its widths."""
-    image_of = batch.spread(batch.pairs[:, side])
-    order, (present, counts) = np.argsort(image_of, kind="stable"), np.unique(image_of, return_counts=True)
-    places = np.empty((len(image_of), 2))
-    for image, rows in zip(present.tolist(), np.split(order, np.cumsum(counts)[:-1]), strict=True):
-        width = max(images.lenses[images.lens_of[image]].width, 1)
-        places[rows] = pictures.pixels(image, batch.keypoints[rows, side]) / width
+    places = np.empty((len(batch.keypoints), 2))
+    for image, rows in enumerate(RowLists.by_label(batch.spread(batch.pairs[:, side]))):
+        if len(rows):
+            width = max(images.lenses[images.lens_of[image]].width, 1)
+            places[rows] = pictures.pixels(image, batch.keypoints[rows, side]) / width
     return places
 
 

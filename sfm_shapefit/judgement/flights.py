@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, quantile
 from sfm_shapefit.base.geometry import INSIDE, distances_in_spreads
 from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, MOST_AGAINST, MOST_COMPARED, OUTNUMBERED, SIGMAS
@@ -70,7 +70,7 @@ def _leaps(centers: FloatArray, numbers: IntArray, least: float) -> FloatArray:
         for before in np.flatnonzero(steps[: count - num - 1] > least).tolist():
             ends, row = np.array([before, before + num + 1]), slice(before + 1, before + num + 1)
             near = np.r_[speeds[max(0, before - _NEARBY) : before], speeds[ends[1] :][:_NEARBY]]
-            usual = SIGMAS * np.quantile(near, _LONG_STEP) * np.abs(numbers[ends][:, None] - numbers[row])
+            usual = SIGMAS * quantile(near, _LONG_STEP) * np.abs(numbers[ends][:, None] - numbers[row])
             far = _distances(centers[ends][:, None], centers[row])
             across = OUTNUMBERED * float(_distances(*centers[ends]))
             if (far > np.maximum(usual, max(across, least))).all() and not found[ends].any():

@@ -43,7 +43,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.geometry import extent_of
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.judgement.evidence import ModelEvidence, how_far
@@ -140,7 +140,7 @@ def _too_few_agree(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
     the cameras agree.
     """
     agreeing, against = evidence.sides
-    joining = 0 < agreeing < len(np.unique(images.frame_of[images.is_posed]))
+    joining = 0 < agreeing < len(distinct(images.frame_of[images.is_posed]))
     if joining and against >= RIVAL_SHARE * agreeing:
         clause = f"{counted(against, 'pair')} contradict{'s' * (against == 1)} it"
         clause = f"{clause}, and only {agreeing} agree{'s' * (agreeing == 1)}, too few to check it"

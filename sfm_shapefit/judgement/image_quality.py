@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct_pairs
 from sfm_shapefit.base.wording import in_pixels
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_each
 from sfm_shapefit.scene.images import Images, KeypointRays
@@ -53,7 +53,7 @@ def image_quality(points: Points, images: Images, pictures: KeypointRays) -> Ima
             errors[k], tracks[k] = misses_px[rows].mean(), np.median(lengths[seen[rows]])
             places = pictures.pixels(k, points.keypoints[rows]) / np.maximum([lens.width, lens.height], 1)
             cells = np.clip(_CELLS * places, 0, _CELLS - 1).astype(np.int64)
-            coverage[k] = len(np.unique(cells, axis=0)) / _CELLS**2
+            coverage[k] = len(distinct_pairs(cells)) / _CELLS**2
     return ImageQuality(
         num_points=counts,
         errors_px=errors,

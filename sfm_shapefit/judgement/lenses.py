@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, distinct, quantile
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import FITTING_PX, LOCAL_SHARE, RIVAL_SHARE, SMALLEST_SHAPE, SURE_SIGMAS
@@ -148,7 +148,7 @@ def find_odd_lenses(
     posed = np.flatnonzero(images.is_posed)
     widths, faults = np.full(len(images.lenses), np.nan), dict[tuple[str, bool], list[int]]()
     reach_px = _reaches(images, points, pictures)
-    for k in np.unique(images.lens_of[posed]).tolist():
+    for k in distinct(images.lens_of[posed]).tolist():
         lens = images.lenses[k]
         if lens.is_adjustable and min(lens.width, lens.height) > 0:
             shape = measure_lens(lens, float(reach_px[k]))
@@ -164,7 +164,7 @@ def find_odd_lenses(
     for rows, _ in find_sequences([images.names[k] for k in posed.tolist()]):
         cameras = posed[rows]
         own = widths[images.lens_of[cameras]]
-        if len(np.unique(images.lens_of[cameras])) >= SMALLEST_SHAPE and np.isfinite(own).all():
+        if len(distinct(images.lens_of[cameras])) >= SMALLEST_SHAPE and np.isfinite(own).all():
             logs = np.log([own, images.focal_lengths_px[cameras]])
             if not any(map(_return_to_few, logs)):
                 logs = np.abs(logs - np.median(logs, axis=1, keepdims=True))
@@ -203,6 +203,4 @@ def _reaches(images: Images, points: Points, pictures: KeypointRays) -> FloatArr
         if len(rows) and lens.is_adjustable:
             away = pictures.pixels(k, points.keypoints[rows]) - _middle(lens)
             far[images.lens_of[k]].append(np.hypot(*away.T))
-    return np.array(
-        [np.quantile(each, _REACHED) if len(each) else np.nan for each in map(np.concatenate, far)]
-    )
+    return np.array([quantile(each, _REACHED) if len(each) else np.nan for each in map(np.concatenate, far)])

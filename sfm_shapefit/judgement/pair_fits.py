@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct_pairs
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import (
@@ -91,7 +91,7 @@ class PairFits:
             ties = ties.taken((ties.lengths() > 2)[ties.points_seen()])
             rays = np.stack([frame_of[ties.images], count + ties.points_seen()], axis=1)
             edges, count = np.concatenate([edges, rays]), count + ties.num_points
-        edges = np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
+        edges = distinct_pairs(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1))
         rows = edges[parallel_rigid_pieces(count, edges, 3) == 0] if len(edges) else edges
         return np.asarray(np.isin(frame_of, rows) & np.isfinite(self.centers).all(axis=1))
 

@@ -66,7 +66,8 @@ class GroupApart(CameraGroup):
     @property
     def statement(self) -> str:
         """The same in a sentence."""
-        turn = f"; {self.num_turned} agree on a turn by {self.turn_deg:.0f} deg" if self.num_turned else ""
+        turns = self.num_turned if (self.turn_deg or 0.0) >= 0.5 else 0
+        turn = f"; {turns} agree on a turn by {self.turn_deg:.0f} deg" if turns else ""
         return (
             f"{len(self.images)} cameras stand apart from the rest ({first_of(self.images)}): "
             f"{counted(self.num_agreeing, 'pair')} between them and the rest agree, {self.num_contradicting} "

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray, quantile
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, FEWEST_ALIKE, KNOWN_DEG
 
 
@@ -16,7 +16,7 @@ def find_line(directions: FloatArray) -> FloatArray | None:
         along = directions @ line
         across = np.linalg.norm(directions - along[:, None] * line, axis=1)
         angles_deg = np.degrees(np.arctan2(across, np.abs(along)))
-        near = angles_deg <= np.quantile(angles_deg, 1.0 - CHANCE_SHARE)
+        near = angles_deg <= quantile(angles_deg, 1.0 - CHANCE_SHARE)
         line = np.linalg.svd(directions[near], full_matrices=False)[2][0]
     return line if bool(angles_deg[near].max() <= KNOWN_DEG) else None
 

@@ -10,9 +10,9 @@ from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, CHECKED_BY, FEWEST_POINTS, OUTNUMBERED, SMALLEST_SHAPE
+from sfm_shapefit.scene.epipolar import sampson_px, write_ray
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
-from sfm_shapefit.tracks.joining import sampson_px, write_ray
 from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints
 
 _MATCHES_A_SLICE = 4_000_000  # matches between which Python can be interrupted: about 0.2 s

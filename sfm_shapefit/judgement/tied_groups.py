@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray, distinct
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED
 from sfm_shapefit.judgement.pair_fits import PairFits
@@ -55,7 +55,7 @@ def tie_images(
     lost = lost_points(view, structure, fitting, group[frames])
     rays = rays._replace(fits=fitting & ~lost[rays.points])
     tied, groups = find_groups(group, rays, pairs, images_of)
-    posed, of = np.unique(frames[images.is_posed]), tied[frames]
+    posed, of = distinct(frames[images.is_posed]), tied[frames]
     if 2 * np.bincount(tied[posed]).max(initial=0) < len(posed):
         held = fits.held(images)
         if 2 * held.sum() < images.is_posed.sum():

@@ -27,7 +27,15 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, rows_taken, sum_by
+from sfm_shapefit.base.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    distinct,
+    distinct_pairs,
+    rows_taken,
+    sum_by,
+)
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.wording import are, counted
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
@@ -118,7 +126,7 @@ class Rays(NamedTuple):
         """Yield the links of some points at a time."""
         rays = np.bincount(self.points)
         block = (np.cumsum(rays * (rays - 1) // 2) // _LINKS_A_BLOCK)[self.points]
-        return (rows_taken(self, block == number).links() for number in np.unique(block).tolist())
+        return (rows_taken(self, block == number).links() for number in distinct(block).tolist())
 
 
 def links_of_pairs(agreeing: IntArray, contradicting: IntArray) -> NodeLinks:
@@ -141,7 +149,7 @@ def find_groups(
     points, is_done = rows_taken(rays, (others > 0)[rays.points]).links(), False
     while not is_done:
         united = _unite(_unite(group, points, _BY_POINTS), pairs, _BY_PAIRS)
-        is_done, group = len(np.unique(united)) == len(np.unique(group)), united
+        is_done, group = len(distinct(united)) == len(distinct(group)), united
     sizes = np.bincount(group)
     names = np.argsort(-sizes, kind="stable")[: np.sum(sizes > 1)].tolist()
     untied = tuple(_describe(group == name, points, pairs, images_of) for name in names[1:])
@@ -166,13 +174,13 @@ def find_hanging(
     edges = _distinct_edges(np.concatenate([edges, shared]))
     outside, points = _outside(count, edges), rays.links()
     among = connected_components(count, edges[outside[edges].all(axis=1)])
-    groups = (outside & (among == name) for name in np.unique(among[outside]).tolist())
+    groups = (outside & (among == name) for name in distinct(among[outside]).tolist())
     return tuple(replace(_describe(group, points, pairs, images_of), is_loose=False) for group in groups)
 
 
 def _distinct_edges(edges: IntArray) -> IntArray:
     """Return each edge (m, 2) of two nodes once."""
-    return np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
+    return distinct_pairs(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1))
 
 
 def _outside(count: int, edges: IntArray) -> BoolArray:
@@ -206,7 +214,7 @@ def rigid_groups(count: int, rays: Rays, known: IntArray) -> IntArray:
     names, fitting, missing = _count(group, rows_taken(rays, rays.points % step == 0).blocks())
     names = names[_BY_POINTS.tie(fitting, missing)]
     strong = np.concatenate([np.column_stack(np.divmod(names, count)), known])
-    strong = np.unique(np.sort(strong, axis=1), axis=0)
+    strong = distinct_pairs(np.sort(strong, axis=1))
     if len(strong):
         piece = parallel_rigid_pieces(count, strong, 3)
         order = np.argsort(-piece, kind="stable")  # a node of several pieces is in the largest
@@ -243,7 +251,7 @@ def _describe(inside: BoolArray, points: NodeLinks, pairs: NodeLinks, images_of:
             ends.append(fitting.ends)
             facts += says * fitting.number
     every = np.concatenate(ends)
-    of_one = any((every == node).any(axis=1).all() for node in np.unique(every).tolist())
+    of_one = any((every == node).any(axis=1).all() for node in distinct(every).tolist())
     agreeing, contradicting, shared, _ = numbers
     return UntiedGroup(
         images=images_of(inside),

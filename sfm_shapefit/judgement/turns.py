@@ -43,7 +43,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, quantile, rows_taken
 from sfm_shapefit.base.geometry import nearest_rotations, rotation_angles_deg
 from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
@@ -244,7 +244,6 @@ class _Judged(NamedTuple):
 
     @property
     def kind(self) -> Doubt:
-        """The verdict."""
         share = self.placed / max(self.placed + self.turned, 1e-300)
         if share < RIVAL_SHARE * RIGHT_SHARE and self.num_turned > 1:
             return Doubt.TURNED
@@ -261,7 +260,6 @@ class _Verdicts:
         self.body_of: IntArray = np.arange(count)
 
     def note(self, members: IntArray, found: _Judged) -> None:
-        """Note what is said of the groups of a body."""
         for member in members.tolist():
             self.judged[member] = found
         self.body_of[members] = members[0]
@@ -281,7 +279,7 @@ class _Verdicts:
 
 def _pairs_of(members: IntArray, touching: RowLists) -> IntArray:
     """Return the pairs that some groups have a part in, ascending; `touching` has the ends of each group."""
-    return np.unique(touching.subset(members).rows // 2)
+    return distinct(touching.subset(members).rows // 2)
 
 
 def _angles(rotations: FloatArray) -> FloatArray:
@@ -294,8 +292,8 @@ def _level(pairs: PairTurns) -> float:
     known = np.isfinite(pairs.sigmas_rad)
     if not known.any():
         return 1.0
-    quantile = float(np.quantile(_angles(pairs.turns[known]) / pairs.sigmas_rad[known], _LEVEL_QUANTILE))
-    return quantile / _NORMAL_QUANTILE
+    ratios = _angles(pairs.turns[known]) / pairs.sigmas_rad[known]
+    return float(quantile(ratios, _LEVEL_QUANTILE)) / _NORMAL_QUANTILE
 
 
 def _contradicts(pairs: PairTurns) -> BoolArray:

@@ -88,6 +88,8 @@ class CholeskyFactor:
     workers: Workers = field(repr=False, default_factory=lambda: Workers(1))
     """The threads of `refactor` and `solve`."""
     _diagonal: FloatArray = field(repr=False, default_factory=lambda: np.empty(0))
+    _fronts: "_Fronts | None" = field(repr=False, default=None)
+    """How they are factored; None before the first time."""
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -131,12 +133,18 @@ class CholeskyFactor:
             diagonal: (n, b, b) symmetric blocks of the nodes.
             off_diagonal: (m, b, b) blocks (i, j) of the edges (i, j).
         """
-        plan, b = self.plan, self.block
-        self._diagonal[:] = diagonal[plan.permutation].reshape(-1, b * b)
         # Weights are subtracted, with the node that is eliminated first as the column.
         weights = -off_diagonal
-        i, j = plan.inverse[edges].T
+        i, j = self.plan.inverse[edges].T
         weights[i > j] = weights[i > j].transpose(0, 2, 1)
+        return self.refactor_alike(diagonal, weights)
+
+    def refactor_alike(self, diagonal: FloatArray, weights: FloatArray) -> bool:
+        """Factor the Laplacian of symmetric weights (m, b, b) with other blocks (n, b, b) at the nodes.
+
+        Returns what `refactor_blocks` does.
+        """
+        self._diagonal[:] = diagonal[self.plan.permutation].reshape(self._diagonal.shape)
         return self._factor(self._input(np.ascontiguousarray(weights)))
 
     def _input(self, weights: FloatArray) -> _Input:
@@ -149,8 +157,10 @@ class CholeskyFactor:
 
     def _factor(self, given: _Input) -> bool:
         """Factor what is given; return whether all pivots are positive to working precision."""
+        if self._fronts is None:
+            self._fronts = _Fronts.of(self)
         with one_blas_thread():
-            failed, pivot = _factor_all(self, given)
+            failed, pivot = _factor_all(self, given, self._fronts)
         self.smallest_pivot = float(pivot[0])
         self.weakest_node = int(self.plan.permutation[int(pivot[1]) // self.block])
         return not failed and bool(pivot[0] > PIVOT_TOLERANCE * np.finfo(self.dtype).eps)
@@ -191,47 +201,51 @@ class CholeskyFactor:
         return out.reshape(np.shape(rhs))
 
 
-def _factor_all(factor: CholeskyFactor, given: _Input) -> tuple[bool, FloatArray]:
+class _Fronts(NamedTuple):
+    """Who factors which fronts, and where their updates lie."""
+
+    memory: FrontMemory
+    is_large: BoolArray  # (S,) fronts that are factored by strips
+    own: list[int]  # units that one thread does each, ascending
+    needs: list[list[int]]  # for each of them the places among them of those that it waits for
+    shared: list[int]  # units that have a large front, or wait for one: all threads do these at the end
+
+    @classmethod
+    def of(cls, factor: CholeskyFactor) -> "_Fronts":
+        """Return those of a factor."""
+        plan, memory = factor.plan, FrontMemory(factor.plan, factor.workers.threads)
+        is_large = (np.diff(plan.first) + np.diff(plan.row_pointers)) * factor.block >= _LARGE_FRONT
+        for begin, end in plan.tasks:
+            is_large[begin:end] = False
+        is_shared = np.zeros(len(plan.needs), np.bool_)
+        is_shared[plan.unit_of[is_large]] = True
+        for unit, below in enumerate(plan.needs):
+            is_shared[unit] |= is_shared[list(below)].any()
+        is_shared &= memory.num_arenas > 1
+        own, place = np.flatnonzero(~is_shared).tolist(), np.cumsum(~is_shared) - 1
+        needs = [place[list(plan.needs[unit])].tolist() for unit in own]
+        return cls(memory, is_large, own, needs, np.flatnonzero(is_shared).tolist())
+
+
+def _factor_all(factor: CholeskyFactor, given: _Input, fronts: _Fronts) -> tuple[bool, FloatArray]:
     """Factor all supernodes; return whether a pivot was not positive, and the least pivot and its row."""
-    plan, workers = factor.plan, factor.workers
-    memory = FrontMemory(plan, workers.threads)
+    plan, memory = factor.plan, fronts.memory
+    memory.begin()
     units, given = memory.units, given._replace(update_offsets=memory.offsets)
     stack = np.empty(memory.size * factor.block**2, dtype=factor.dtype)  # holds update matrices
     pivots, failed = np.full((len(units), 2), np.inf), np.zeros(len(units), np.bool_)
-    is_large, is_shared = _find_large(factor)
 
     def factor_unit(unit: int) -> None:
-        run, below = units[unit], list(plan.needs[unit])
-        if failed[below].any():
+        if any(failed[below] for below in plan.needs[unit]):
             failed[unit] = True
             return
         with memory.room(unit, memory.leaving[unit], memory.entering[unit]):
-            failed[unit] = _factor_unit(factor, given, stack, run, is_large, pivots[unit])
+            failed[unit] = _factor_unit(factor, given, stack, units[unit], fronts.is_large, pivots[unit])
 
-    is_shared &= memory.num_arenas > 1
-    own, shared = np.flatnonzero(~is_shared).tolist(), np.flatnonzero(is_shared).tolist()
-    place = np.cumsum(~is_shared) - 1
-    needs = [place[list(plan.needs[unit])].tolist() for unit in own]
-    workers.run_after([partial(factor_unit, unit) for unit in own], needs)
-    for unit in shared:
+    factor.workers.run_after([partial(factor_unit, unit) for unit in fronts.own], fronts.needs)
+    for unit in fronts.shared:
         factor_unit(unit)
     return bool(failed.any()), pivots[np.argmin(pivots[:, 0])]
-
-
-def _find_large(factor: CholeskyFactor) -> tuple[BoolArray, BoolArray]:
-    """Return which fronts are factored by strips (S,), and which units wait for such a one or have it (U,).
-
-    Threads share the strips, once they have done all other units.
-    """
-    plan = factor.plan
-    is_large = (np.diff(plan.first) + np.diff(plan.row_pointers)) * factor.block >= _LARGE_FRONT
-    for begin, end in plan.tasks:
-        is_large[begin:end] = False
-    is_shared = np.zeros(len(plan.needs), np.bool_)
-    is_shared[plan.unit_of[is_large]] = True
-    for unit, below in enumerate(plan.needs):
-        is_shared[unit] |= is_shared[list(below)].any()
-    return is_large, is_shared
 
 
 def _factor_unit(

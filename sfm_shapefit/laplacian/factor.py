@@ -61,6 +61,10 @@ class Factor(LaplacianFactor, Protocol):
         """Factor a matrix with blocks of its own; return whether it is positive definite."""
         ...
 
+    def refactor_alike(self, diagonal: FloatArray, weights: FloatArray) -> bool:
+        """Factor a Laplacian with blocks of its own at the nodes; return whether it is positive definite."""
+        ...
+
     def selected_inverse(self, edges: IntArray) -> SelectedInverse:
         """Return the blocks of the inverse at the nodes and edges (m, 2)."""
         ...

@@ -20,9 +20,7 @@ class FrontMemory:
 
     def __init__(self, plan: SymbolicFactor, threads: int) -> None:
         """Begin with nothing in it."""
-        self.offsets = plan.update_offsets.copy()
-        """(S,) start of each update matrix, in (block) entries, once it has a place."""
-        self.units = plan.units
+        self.units, self._places = plan.units, plan.update_offsets.copy()
         self.num_arenas = min(threads, len(self.units))
         """Number of units that can be at work."""
         parent, unit_of, arenas = plan.parent, plan.unit_of, self.num_arenas * plan.arena_size
@@ -35,12 +33,19 @@ class FrontMemory:
         for s, start, end in zip(between, unit_of[between], unit_of[parent[between]], strict=True):
             self.leaving[start].append(int(s))
             self.entering[end].append(int(s))
-        self.offsets[between] += arenas
+        self._places[between] += arenas
         self.size = arenas + plan.stack_size
         """(Block) entries in all."""
         if self.num_arenas > 1:  # enough for any order; the last places are hardly ever touched
             self.size = arenas + int(self._areas[between].sum())
-        self._free, self._lock, self._arena_size = [(arenas, self.size)], threading.Lock(), plan.arena_size
+        self._lock, self._arena_size = threading.Lock(), plan.arena_size
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin anew, with nothing in it."""
+        self.offsets = self._places.copy()
+        """(S,) start of each update matrix, in (block) entries, once it has a place."""
+        self._free = [(self.num_arenas * self._arena_size, self.size)]
         self._arenas = SimpleQueue[int]()
         for k in range(self.num_arenas):
             self._arenas.put(k)

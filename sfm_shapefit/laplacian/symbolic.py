@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
+from sfm_shapefit.base.arrays import Int32Array, IntArray, distinct, frozen
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.laplacian.operators import Adjacency, group_by
 
@@ -216,7 +216,6 @@ def plan_factorization(graph: Adjacency, edges: IntArray, tree: EliminationTree)
 
 
 def _inverse(permutation: IntArray) -> IntArray:
-    """Return the inverse of a permutation."""
     inverse = np.empty_like(permutation)
     inverse[permutation] = np.arange(len(permutation))
     return inverse
@@ -425,7 +424,7 @@ def _tasks(parent: IntArray, sizes: IntArray) -> tuple[IntArray, IntArray]:
         np.flatnonzero(is_large & ~is_next),
         np.flatnonzero(is_large & ~np.append(is_next[1:], False)) + 1,
     ]
-    bounds = np.unique(np.concatenate([[0, num], tasks.ravel(), *cuts]))
+    bounds = distinct(np.concatenate([[0, num], tasks.ravel(), *cuts]))
     runs = np.stack([bounds[:-1], bounds[1:]], axis=1)
     return tasks, runs[~np.isin(bounds[:-1], tasks[:, 0])]
 

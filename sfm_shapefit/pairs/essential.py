@@ -14,7 +14,7 @@ ideal camera that sees all around, one pixel per radian. A pair without parallax
 averaging, cameras that only turn are as good as others.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
 from typing import NamedTuple
@@ -64,7 +64,6 @@ def have_many_pairs(num_images: int, num_pairs: int) -> bool:
 def estimate_relative_rotations(
     batch: RayMatches,
     threads: int = 1,
-    advance: Callable[[int], None] | None = None,
     *,
     are_many: bool = False,
     likely: LikelyPoses | None = None,
@@ -76,7 +75,6 @@ def estimate_relative_rotations(
     Args:
         batch: rays in camera axes, that is, of a model whose rotations are the identity.
         threads: number of threads to share the pairs among; the answer does not depend on it.
-        advance: called with the number of pairs that are done, each time some are.
         are_many: whether images have so many pairs that each is tried less often; see `have_many_pairs`.
         likely: poses of the batch's pairs. Where the matches fit near one, that is the answer; the trials,
             nine tenths of the time, are for the others.
@@ -92,15 +90,12 @@ def estimate_relative_rotations(
     for part, has_pose in in_threads(threads, partial(_estimate_slice, batch, are_many), slices):
         places.append(slices[len(parts) - (likely is not None)][has_pose])
         parts.append(part)
-        if advance is not None:
-            advance(sum(map(len, places)))
     return concatenate_rotations(parts).subset(np.argsort(np.concatenate([*places, others[:0]])))
 
 
 def refine_rough_rotations(
     batch: RayMatches,
     threads: int,
-    advance: Callable[[int], None],
     *,
     rotations: FloatArray,
     sigma_rad: float,
@@ -108,7 +103,7 @@ def refine_rough_rotations(
     """Return the relative rotation of every pair that fits its matches best, near a rough one.
 
     Args:
-        batch, threads, advance: as of `estimate_relative_rotations`.
+        batch, threads: as of `estimate_relative_rotations`.
         rotations: (n, 3, 3) of all images, cam_from_world.
         sigma_rad: standard deviation per axis of the rotation of each image.
     """
@@ -120,9 +115,7 @@ def refine_rough_rotations(
     sums = np.add.reduceat(products, batch.offsets[:-1], axis=0)
     translations = np.linalg.eigh(sums)[1][:, :, 0]  # rays meet in planes with it
     off_rad = _ROUGH_WIDTH * sigma_rad
-    refined = refine_two_view_poses(batch, rotations, translations, threads, off_rad)
-    advance(len(batch.pairs))
-    return refined
+    return refine_two_view_poses(batch, rotations, translations, threads, off_rad)
 
 
 def concatenate_rotations(parts: Sequence[RelativeRotations]) -> RelativeRotations:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.lists import Lists, offsets_of
 from sfm_shapefit.pairs.essential import LikelyPoses, estimate_relative_rotations
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
@@ -142,7 +142,7 @@ def _rays(matches: _PixelMatches, lenses: tuple[Lens, ...], own: BoolArray, fact
     scaled = [lens.longer(factor) if own[k] else lens for k, lens in enumerate(lenses)]
     pair_of = matches.list_of_rows()
     rays = np.empty((*matches.pixels.shape[:2], 3))
-    for k in np.unique(matches.lenses).tolist():
+    for k in distinct(matches.lenses).tolist():
         sees = matches.lenses[pair_of] == k
         rays[sees] = scaled[k].rays(matches.pixels[sees])
     has_ray = np.isfinite(rays).all(axis=(1, 2))

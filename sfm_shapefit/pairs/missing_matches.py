@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.scene.matches import KeypointMatches
 
 _RANK = 1e-6  # ratio of squared singular values; matches on a line to a thousandth say nothing across it
@@ -57,7 +57,7 @@ def matched_shares(
     """
     if len(batch.pairs) == 0:
         return np.zeros(0)
-    images = {k: _Image.of(pixels[k], sizes[k], partners[k]) for k in np.unique(batch.pairs).tolist()}
+    images = {k: _Image.of(pixels[k], sizes[k], partners[k]) for k in distinct(batch.pairs).tolist()}
     own, pairs = np.empty((2, len(batch.keypoints), 2)), batch.pairs.tolist()
     rows = batch.slices()
     for part, ends in zip(rows, pairs, strict=True):
@@ -88,7 +88,6 @@ class _Image(NamedTuple):
 
     @classmethod
     def of(cls, pixels: FloatArray, size: FloatArray, partners: IntArray) -> "_Image":
-        """Return the keypoints of an image that are matched."""
         matched = partners > 0
         return cls(np.ascontiguousarray(pixels[matched].T), partners[matched], np.cumsum(matched) - 1, size)
 

@@ -5,6 +5,7 @@ once, and rotations that the matches know better than whoever gave them.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.run import begin
 from sfm_shapefit.adjustment.sources import links_touching
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import normalized, tangent_bases, turned_deg
@@ -82,7 +83,7 @@ def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
     measured = state.measured
     if not adjusted.freedom.holds_rotations or adjusted.is_refined.any() or adjusted.refines_sensors:
         source = source.at(images.turned(adjusted.images))
-        frames = np.unique(images.frame_of[rows])
+        frames = distinct(images.frame_of[rows])
         corrected = frames[np.broadcast_to(adjusted.freedom.singled_out(), len(frames))]
         is_corrected = np.isin(images.frame_of, corrected)
         directions = _measure_again(source, state.directions, is_corrected, options.directions, clock)
@@ -97,7 +98,7 @@ def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
         source=source,
         measured=measured,
         placement=move_cameras(placement, locations),
-        intrinsics=state.intrinsics.after(adjusted, np.unique(images.lens_of[rows])),
+        intrinsics=state.intrinsics.after(adjusted, distinct(images.lens_of[rows])),
         adjustment=adjusted,
         turned_deg=turned_deg(images.rotations, source.images.rotations),
     )
@@ -135,7 +136,8 @@ def _measure_again(
     used = earlier.pairs[usable]
     others = source.view.pairs[~is_among(source.view.pairs, used)]
     batches = source.view.batches(without=others, advance=clock.advance)
-    again = concatenate([estimate_directions(batch, options, clock.threads) for batch in batches])
+    estimate = partial(estimate_directions, options=options, threads=clock.threads)
+    again = concatenate(list(source.view.measured(batches, estimate, clock.threads)))
     rows = again.usable()
     is_anew = corrected[again.pairs[rows]].any(axis=1)
     taken = {"directions": rows, **dict.fromkeys(_SAID_OF_MATCHES, rows[is_anew])}

@@ -22,7 +22,7 @@ from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens, Origin
-from sfm_shapefit.scene.matches import RayMatches, is_among, rows_of_pairs
+from sfm_shapefit.scene.matches import MatchBatch, RayMatches, is_among, rows_of_pairs
 
 _LEAST_MATCHES = 8  # matches; a pair of fewer is never sound, see `RelativeRotations.are_sound`
 _POOR = 0.9  # robust weight of a pair as placed; below, its camera is asked whether it is turned
@@ -71,15 +71,16 @@ def ask_rotations(
 
     What pairs say alone, or else the `given` directions, those of many pairs, is tried first.
     """
-    parts = []
-    for batch in source.view.of_pairs(pairs):
+
+    def ask(batch: MatchBatch) -> RelativeRotations:
         rays = _thin(source.images, batch)
         likely = _poses_alone(source.alone, rays.pairs)
         if likely is None and given is not None:
             rows = np.flatnonzero(is_among(given.pairs, rays.pairs))  # both ascend
             likely = _poses_as_given(source.images, given, rows)
-        parts.append(estimate_relative_rotations(rays, threads, are_many=given is not None, likely=likely))
-    return concatenate_rotations(parts)
+        return estimate_relative_rotations(rays, threads, are_many=given is not None, likely=likely)
+
+    return concatenate_rotations(list(source.view.measured(source.view.of_pairs(pairs), ask, threads)))
 
 
 def _poses_as_given(images: Images, directions: PairDirections, rows: IntArray) -> LikelyPoses:

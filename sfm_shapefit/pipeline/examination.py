@@ -8,7 +8,7 @@ import numpy as np
 from sfm_shapefit.adjustment.lens_doubts import excess
 from sfm_shapefit.adjustment.open_shape import estimate_open_shape
 from sfm_shapefit.adjustment.sources import Links
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.base.geometry import fit_similarity
@@ -191,7 +191,7 @@ def images_to_ask(images: Images, asked: BoolArray | None) -> BoolArray | None:
     if every.max(initial=0) <= _MOST_ASKED:
         return asked
     some = images.is_posed if asked is None else images.is_posed & asked
-    for lens in np.unique(images.lens_of[some]).tolist():
+    for lens in distinct(images.lens_of[some]).tolist():
         rows = np.flatnonzero(some & (images.lens_of == lens))
         some[rows] = np.arange(len(rows)) % -(-len(rows) // _MOST_ASKED) == 0
     return some

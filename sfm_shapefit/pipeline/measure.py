@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray, quantile
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
@@ -87,9 +87,14 @@ def measure(
                 beside.add(batch, directions)
     else:
         parts = []
-        for batch in source.view.batches(1, without, clock.advance, clock.threads):
-            parts.append(estimate_directions(batch, options, clock.threads))
-            beside.add(batch, parts[-1])
+
+        def estimated(batch: MatchBatch) -> tuple[MatchBatch, PairDirections]:
+            return batch, estimate_directions(batch, options, clock.threads)
+
+        batches = source.view.batches(1, without, clock.advance)
+        for batch, directions in source.view.measured(batches, estimated, clock.threads):
+            parts.append(directions)
+            beside.add(batch, directions)
     if not parts and without is not None:
         raise UnsolvableError("no image that is not fixed shares matches with another; match the new images")
     if not parts:
@@ -211,10 +216,10 @@ def build_graph(
 
 def _is_held_by_pairs(graph: ViewGraph) -> bool:
     """Return whether the pairs alone hold many cameras: rigidly, each by many pairs of many directions."""
-    if graph.num_nodes < _MANY_CAMERAS or np.quantile(graph.degrees(), _FEW_CAMERAS) < _MANY_PAIRS:
+    if graph.num_nodes < _MANY_CAMERAS or quantile(graph.degrees(), _FEW_CAMERAS) < _MANY_PAIRS:
         return False
     spread = direction_spread(graph.num_nodes, graph.edges, graph.directions)
-    is_spread = np.quantile(spread, _FEW_CAMERAS) >= _WIDELY_SPREAD
+    is_spread = quantile(spread, _FEW_CAMERAS) >= _WIDELY_SPREAD
     return bool(is_spread) and is_parallel_rigid(graph.num_nodes, graph.edges, graph.dimension)
 
 

@@ -145,7 +145,6 @@ class _Growing:
         """New ids of each piece's points, by the old ones."""
 
     def add(self, done: JoinFacts, piece: ModelPiece, tied: TiedPieces) -> None:
-        """Take in a piece that was joined to one of the group."""
         assert done.join is not None
         world_from = compose(self.group.world_from[done.to_number], done.join.to_from_piece)
         worlds = {**self.group.world_from, done.number: world_from}

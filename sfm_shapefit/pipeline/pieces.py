@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import METRIC_SIGMA, normalized
 from sfm_shapefit.base.lists import offsets_of
@@ -169,7 +169,7 @@ class _Seen:
         is_camera = ids < -1
         xyz[is_camera] = self.cameras.centers[_camera_id(ids[is_camera])]
         numbers = self.cameras.piece_of[cameras]
-        for number in np.unique(numbers[ids >= 0]).tolist():
+        for number in distinct(numbers[ids >= 0]).tolist():
             rows, points = (
                 np.flatnonzero((ids >= 0) & (numbers == number)),
                 self.pieces[number].model.arrays.points,

@@ -16,8 +16,9 @@ from sfm_shapefit.judgement.verdicts import Hold, find_hold
 from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.pipeline.measure import add_evidence, build_graph
 from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged
-from sfm_shapefit.placement.place import InitialPlacement, Placement, place_pieces
+from sfm_shapefit.placement.place import Placement, place_pieces
 from sfm_shapefit.refinement.placement_options import PlacementOptions
+from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.solver.solver_options import reported
 from sfm_shapefit.tracks.structure_options import NodeOptions
@@ -31,7 +32,7 @@ def place_cameras(
     options: PlacementOptions,
     nodes: NodeOptions,
     clock: Clock,
-    near: InitialPlacement | None = None,
+    near: RefinedPlacement | None = None,
     *,
     certified: bool = True,
 ) -> Iterator[Placement]:
@@ -72,7 +73,7 @@ class PlacingSetup(NamedTuple):
     options: PlacementOptions
     nodes: NodeOptions
     clock: Clock
-    near: InitialPlacement | None = None
+    near: RefinedPlacement | None = None
 
     def place(self, graph: MeasuredGraph, *, certified: bool = True) -> Iterator[Placement]:
         """Place the rigid pieces of a graph, see `place_cameras`."""

@@ -23,7 +23,7 @@ import numpy as np
 from sfm_shapefit import __version__
 from sfm_shapefit.adjustment.sources import collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate
-from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.arrays import BoolArray, distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.check_result import CheckResult, checked_camera_rows, checked_pair_rows
@@ -32,7 +32,7 @@ from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import contradicting, model_options
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
+from sfm_shapefit.files.colmap.points import ModelKeypoints, structure_of
 from sfm_shapefit.judgement.check_reasons import CheckedModel, of_alike_pictures, reasons_against
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
@@ -121,9 +121,8 @@ def check_source(
 def read_structure(state: CheckState, clock: Clock) -> CheckState:
     """Read the points of a model, and how well they hold each image."""
     with clock("points"):
-        arrays, images = state.model.arrays, state.images
-        pictures = ModelKeypoints(images, points2d_of(arrays, images))
-        structure = Structure(points_of(arrays, images), images, pictures)
+        images = state.images
+        structure = structure_of(state.model.arrays, images)
         quality = image_quality(*structure[:3])
         weak = tuple(find_weak_images(images, quality))
         return replace(state, structure=structure, quality=quality, weak=weak)
@@ -226,7 +225,7 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
         loose_groups=[],
         versions={"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
         mean_reprojection_error_px=float(errors_px.mean()) if len(errors_px) else np.nan,
-        num_lenses=len(np.unique(state.images.lens_of)),
+        num_lenses=len(distinct(state.images.lens_of)),
         median_track_length=_median(quality.point_track_lengths.tolist()),
         residual_level_deg=np.nan if fits is None else fits.level_deg,
         timings_s=clock.seconds,

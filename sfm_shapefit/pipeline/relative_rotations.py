@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, rank_within
 from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.pairs.direction_options import LEAST_MATCHES, DirectionOptions
 from sfm_shapefit.pairs.essential import (
     LikelyPoses,
@@ -63,7 +64,6 @@ def measure_rotations(
 def estimate_near(
     batch: RayMatches,
     threads: int = 1,
-    advance: Callable[[int], None] | None = None,
     *,
     are_many: bool,
     rotations: FloatArray,
@@ -80,7 +80,7 @@ def estimate_near(
     in_axes_of_j = replace(batch, rays_i=rays_i)
     baselines = estimate_directions(in_axes_of_j, _NEAR, threads).directions
     likely = LikelyPoses(turns, baselines, np.full(len(batch.pairs), _LIKELY))
-    return estimate_relative_rotations(batch, threads, advance, are_many=are_many, likely=likely)
+    return estimate_relative_rotations(batch, threads, are_many=are_many, likely=likely)
 
 
 def _all_but_some(view: View) -> IntArray:
@@ -101,16 +101,8 @@ def estimate_here(
 ) -> RelativeRotations:
     """Return the relative rotations of a view's pairs, but for some of them, by threads of this process.
 
-    `estimate` is called with a batch, the number of threads, and whom to tell of pairs that are done.
+    `estimate` is called with a batch and the number of threads.
     """
-    parts, num_before, total = [], 0, view.num_pairs
-    for batch in view.batches(min_matches, without, threads=clock.threads):
-
-        def advance(done: int, num_before: int = num_before) -> None:
-            clock.advance(num_before + done, total)
-
-        parts.append(estimate(batch, clock.threads, advance))
-        num_before += len(batch.pairs)
-    if without is None:
-        clock.advance(total, total)
-    return concatenate_rotations(parts)
+    batches = view.batches(min_matches, without, clock.advance if without is None else nobody)
+    own = partial(estimate, threads=clock.threads)
+    return concatenate_rotations(list(view.measured(batches, own, clock.threads)))

@@ -36,7 +36,6 @@ from sfm_shapefit.pipeline.measure import MeasureRequest, measure, wants_points
 from sfm_shapefit.pipeline.placing import PlacingSetup, place_first
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
-from sfm_shapefit.placement.place import InitialPlacement
 from sfm_shapefit.scene.images import Images
 
 _NEAR = 6.0  # standard deviations of an image that a pair may turn by; two images and three axes give 5.7
@@ -107,7 +106,7 @@ def adjust_first_placement(
         source=source,
         rigid=find_fixed_and_rigged(source.images),
         intrinsics=intrinsics,
-        near=InitialPlacement(centers, placement.refined),
+        near=replace(placement.refined, locations=centers),
         first=adjusted,
     )
 

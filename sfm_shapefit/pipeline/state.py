@@ -8,7 +8,7 @@ import numpy as np
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import Advance, Crew
 from sfm_shapefit.base.geometry import Similarity
@@ -27,7 +27,8 @@ from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
 from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged, find_fixed_and_rigged
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.gauge_rule import GaugeRule
-from sfm_shapefit.placement.place import InitialPlacement, Placement
+from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.matches import is_among
@@ -48,8 +49,8 @@ class ModelState:
     rigid: FixedAndRigged
     intrinsics: RefinedIntrinsics
     """What may still change of lenses in doubt, and what became of them so far."""
-    near: InitialPlacement | None = None
-    """Where the adjustment of a first placement has the images."""
+    near: RefinedPlacement | None = None
+    """A first placement, at the centers (i, 3) where its adjustment has the images, NaN for others."""
     first: Estimate | None = None
     """How a first placement was adjusted."""
     measured: MeasuredPairs = _LATER
@@ -177,14 +178,14 @@ class ModelState:
     def freedom_of(self, rows: IntArray) -> Freedom:
         """Return the freedom of the frames and lenses of some images (r,)."""
         images = self.source.images
-        return self.freedom.of(np.unique(images.frame_of[rows]), np.unique(images.lens_of[rows]))
+        return self.freedom.of(distinct(images.frame_of[rows]), distinct(images.lens_of[rows]))
 
     def given_poses(self, rows: IntArray) -> GivenPoses:
         """Return what is known of the frames of some images (r,) beside the pixels."""
         images = self.inputs.images
         rotations = None if self.adjustment is None else images.frames.rotations
         given = GivenPoses(rotations, self.inputs.fixed_frames, self.held)
-        return given.of(np.unique(images.frame_of[rows]))
+        return given.of(distinct(images.frame_of[rows]))
 
     def crew_of(self, clock: Clock) -> Crew:
         """Return who works, and how for memory."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, sum_by
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, sum_by
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import median_spread, normalized
 from sfm_shapefit.solver.program import differences
@@ -96,7 +96,7 @@ def condition(
     labels = connected_components(n, used[loose[used].all(axis=1)])
     causes: list[Looseness | None] = [None] * num_cameras
     groups = []
-    for label in np.unique(labels[loose]).tolist():
+    for label in distinct(labels[loose]).tolist():
         members = np.flatnonzero(loose & (labels == label))
         is_straight = _is_straight(locations[members])
         for camera in members.tolist():

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct_pairs
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import Similarity, compose, invert, rotation_angles_deg
@@ -229,7 +229,7 @@ class _JoinedWorld(NamedTuple):
         """
         pieces, count = self.evidence.pieces, self.evidence.cameras.num_pieces
         support = np.zeros((count, count), dtype=np.int64)
-        for two in np.unique(pieces, axis=0):
+        for two in distinct_pairs(pieces):
             between = (pieces == two).all(axis=1) & self.agrees & counted
             weight = self.evidence.weigh(between)
             if weight < FEWEST_PAIRS <= max(weight, int(between.sum())) + 1:
@@ -392,7 +392,7 @@ def _find_rivals(joint: _JoinedWorld, false: IntArray) -> _Rivals:
     evidence = joint.evidence
     named = np.isin(evidence.rows, false)
     in_doubt, beaten = np.zeros((2, len(evidence.rows)), dtype=np.bool_)
-    for two in np.unique(evidence.pieces[~joint.agrees], axis=0):
+    for two in distinct_pairs(evidence.pieces[~joint.agrees]):
         between = (evidence.pieces == two).all(axis=1)
         agreeing = between & joint.agrees
         part = evidence.part(evidence.numbers[two], ~joint.agrees)

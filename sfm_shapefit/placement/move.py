@@ -1,7 +1,5 @@
 """A placement whose cameras an adjustment has moved: other locations of the same graph."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
@@ -17,11 +15,7 @@ def move_cameras(placement: Placement, locations: FloatArray) -> Placement:
     moved = refined.locations.copy()
     moved[: len(earlier)][has_location] = locations[has_location]
     by = float(np.median(np.linalg.norm(moved[: len(earlier)] - earlier, axis=1))) / median_spread(earlier)
-    adjusted = replace(
-        refined,
-        locations=follow_cameras(placement.measured_part(), moved),
-        reason=f"{refined.reason}; then adjusted to the pixels, which moved cameras by {by:.2%} (median)",
-        reset_nodes=np.setdiff1d(refined.reset_nodes, np.flatnonzero(has_location)),
-        variances=None,
-    )
-    return replace_locations(placement, adjusted)
+    why = f"{refined.finish.reason}; then adjusted to the pixels, which moved cameras by {by:.2%} (median)"
+    locations = follow_cameras(placement.measured_part(), moved)
+    reset = np.setdiff1d(refined.reset_nodes, np.flatnonzero(has_location))
+    return replace_locations(placement, refined.moved_to(locations, reset, reason=why))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct_pairs
 from sfm_shapefit.base.geometry import mean_rotation_l1, median_spread, nearest_rotations, rotation_angles_deg
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.base.losses import GEMAN_MCCLURE, weighed
@@ -189,7 +189,7 @@ def turn_pieces(votes: Votes, num_pieces: int) -> FloatArray:
 
 def _elect(votes: Votes, has_turn: BoolArray) -> Iterator[tuple[float, int, int, FloatArray]]:
     """Yield, of every two pieces with votes, the support of the turn that most agree with, and the turn."""
-    for first, second in np.unique(votes.pieces[has_turn], axis=0).tolist():
+    for first, second in distinct_pairs(votes.pieces[has_turn]).tolist():
         rows = np.flatnonzero(has_turn & (votes.pieces == [first, second]).all(axis=1))
         turns, sigmas, soundness = votes.turns[rows], votes.sigmas_deg[rows], votes.soundness[rows]
         near = rotation_angles_deg(turns[:, None].transpose(0, 1, 3, 2) @ turns[None]) <= AGREEMENT_DEG

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
@@ -34,15 +34,6 @@ SMALLEST_PIECE = 3
 _LEAST_OFFSETS = 1e-6  # median baselines; with shorter ones their scale means nothing
 _MOST_WATCHED = 100_000
 """Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
-
-
-class InitialPlacement(NamedTuple):
-    """Where an adjustment has cameras already."""
-
-    locations: FloatArray
-    """(n, 3) centers of all cameras, in any scale and from any origin; NaN for those it lacks."""
-    refined: RefinedPlacement
-    """The placement that it started from."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -127,7 +118,7 @@ class Placement(Displayed):
             "num_pairs": self.num_pairs,
             "num_pairs_rejected": len(self.rejected_pairs),
             "residual_level_deg": float(np.degrees(self.agreement.level_rad)),
-            "start": self.refined.start,
+            "start": self.refined.finish.start,
             "solve": self.certified.summary(),
         }
 
@@ -164,7 +155,7 @@ def place_pieces(
     measured: MeasuredGraph,
     options: PlacementOptions,
     *,
-    near: InitialPlacement | None = None,
+    near: RefinedPlacement | None = None,
     certified: bool = True,
     on_iteration: OnIteration | None = None,
 ) -> Iterator[Placement]:
@@ -173,8 +164,9 @@ def place_pieces(
     Args:
         measured: with at least one edge, best with what is known of its directions.
         options: settings.
-        near: a piece all of whose cameras are there is solved for its certificate only: they stay where the
-            adjustment has them.
+        near: an earlier placement, at the centers (n, 3) where an adjustment has all cameras of the graph
+            since, in any scale and from any origin, NaN for those it lacks. A piece all of whose cameras are
+            there is solved for its certificate only, and they stay.
         certified: False proves nothing, for locations that are only a start; see `solve`.
         on_iteration: called after each iteration of the largest piece's solve, on graphs where that costs
             little; returning False ends the solve there, and the placement goes on from the last iterate.
@@ -205,7 +197,7 @@ class _PieceOptions(NamedTuple):
     """How pieces are placed; see `place_pieces`."""
 
     options: PlacementOptions
-    near: InitialPlacement | None
+    near: RefinedPlacement | None
     certified: bool
 
 
@@ -237,7 +229,7 @@ def _place_piece(
     if near is None or centers is None or not np.isfinite(centers).all():
         refined = refine_starts(part, solved, how.options, certified=how.certified)
     else:
-        refined = stay_near(part, solved, centers, near.refined)
+        refined = stay_near(part, solved, centers, near)
     unit, length = measure_unit(part, refined.locations) if part.has_scale else (None, np.inf)
     placement = Placement(
         measured=measured,
@@ -283,7 +275,7 @@ def count_large(pieces: list[RigidPiece], measured: MeasuredGraph) -> int:
 
 def _count_moving(nodes: IntArray, measured: MeasuredGraph) -> int:
     """Return the number of cameras among some nodes, or of the groups that these are in."""
-    return len(np.unique(measured.moving[nodes[nodes < measured.num_cameras]]))
+    return len(distinct(measured.moving[nodes[nodes < measured.num_cameras]]))
 
 
 def refuse_without_triangle(measured: MeasuredGraph, pieces: list[RigidPiece]) -> None:
@@ -317,7 +309,7 @@ def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
         )
     inside = np.isin(groups.group_of[edges], tied).all(axis=1)
     rows = np.flatnonzero(inside & groups.joins(edges))
-    return RigidPiece(nodes=np.unique(edges[rows]), edges=rows, hinges=np.zeros(0, dtype=np.int64))
+    return RigidPiece(nodes=distinct(edges[rows]), edges=rows, hinges=np.zeros(0, dtype=np.int64))
 
 
 def measure_unit(part: MeasuredGraph, locations: FloatArray) -> tuple[float, float]:

@@ -44,16 +44,12 @@ def pull_to_priors(
     known = priors.of(placement.nodes).known
     start = gauge.similarity.apply(refined.locations)
     anchors = _anchor(start, known, np.eye(3) if gauge.axes is None else gauge.axes)
-    levels = np.radians(np.array(refined.levels_deg))
+    levels = np.radians(np.array(refined.finish.levels_deg))
     moved = refine_anchored(part, start, levels, anchors, max_bytes=options.solver.factor_bytes)
     by = float(np.median(np.linalg.norm((moved - start)[: len(placement.cameras)], axis=1)))
     held = anchors.indices[anchors.chi2(moved) <= KERNEL_WIDTH**2]
-    kept = replace(
-        refined,
-        locations=(moved - gauge.similarity.translation) / gauge.similarity.scale,
-        reset_nodes=np.setdiff1d(refined.reset_nodes, held),
-        variances=None,
-    )
+    locations = (moved - gauge.similarity.translation) / gauge.similarity.scale
+    kept = refined.moved_to(locations, np.setdiff1d(refined.reset_nodes, held))
     return Pulled(
         replace_locations(placement, kept),
         replace(gauge, statement=f"{gauge.statement}{PULLED}{by:.3g} (median)"),

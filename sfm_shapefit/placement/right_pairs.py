@@ -6,62 +6,36 @@ directions are. If they are not rigid, some cameras stand where pairs taken for 
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
+from typing import Annotated
 
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.graph.rigidity import rigid_pieces
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.solver.solver_options import SolverOptions, SolverResult
+from sfm_shapefit.solver.solver_options import Solve, SolverOptions, SolverResult
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RightPairs:
-    """The pairs that a placement takes for right, and the program restricted to them."""
+class TakenForRight(Record):
+    """What is certain if the pairs that the answer takes for right are right."""
 
+    statement: Annotated[str, "All of it in a sentence."]
+    num_right: Annotated[int, "Pairs of the largest piece whose posterior in pairs.csv is above one half."]
+    num_fixed: Annotated[int, "Nodes of the largest piece that these pairs alone make parallel rigid."]
+    rigid: Annotated[bool, "Whether these are all nodes that are placed."]
+    solve: Annotated[
+        Solve | None, "The certified program restricted to these pairs; null where they are not rigid."
+    ]
     edges: IntArray
     """Their edges in the graph, ascending."""
-    num_pairs: int
-    """Pairs of the piece, right or wrong."""
-    num_nodes: int
-    """Nodes of the piece."""
-    num_fixed: int
-    """Nodes of the largest piece that these pairs alone make parallel rigid."""
     solved: SolverResult | None
     """The certified program restricted to them; None where it leaves nodes out, or was not solved."""
 
-    @property
-    def is_rigid(self) -> bool:
-        """Whether these pairs alone are parallel rigid on all nodes."""
-        return self.num_fixed == self.num_nodes
-
-    @property
-    def is_certain(self) -> bool:
-        """Whether the restricted program is certified, with one optimum."""
-        return self.solved is not None and self.solved.converged and self.solved.unique is True
-
-    def statement(self) -> str:
-        """Say what is certain, in a sentence."""
-        taken = f"{len(self.edges):,} of {self.num_pairs:,} pairs are taken for right"
-        if not self.is_rigid:
-            return (
-                f"{taken}; they alone fix {self.num_fixed:,} of {self.num_nodes:,} nodes, and "
-                "too few of them hold the others"
-            )
-        if self.solved is None:
-            return f"{taken}; they alone are parallel rigid"
-        gap = f"{max(self.solved.gap, 0.0):.1e}"
-        if self.is_certain:
-            certified = f"has one optimum, certified to {gap}: exact if their directions are"
-        else:
-            certified = f"is certified to {gap}, but not to have one optimum"
-        return f"{taken}; they alone are parallel rigid, and the program restricted to them {certified}"
-
 
 @one_blas_thread()
-def examine_right_pairs(placement: Placement, options: SolverOptions) -> RightPairs:
+def examine_right_pairs(placement: Placement, options: SolverOptions) -> TakenForRight:
     """Return the pairs that a placement of free nodes takes for right, and the program on them alone.
 
     It is solved where the answer comes from other weights. Elsewhere the program of all pairs has its
@@ -79,10 +53,24 @@ def examine_right_pairs(placement: Placement, options: SolverOptions) -> RightPa
         elif placement.refined.reweighted is not None:
             with suppress(UnsolvableError):  # directions that cancel, or a factor too large
                 solved = solve(graph, options)
-    return RightPairs(
-        edges=right,
-        num_pairs=len(edges),
-        num_nodes=len(placement.nodes),
+    num_nodes, taken = len(placement.nodes), f"{len(right):,} of {len(edges):,} pairs are taken for right"
+    return TakenForRight(
+        statement=f"{taken}; they alone {_say_certain(num_fixed, num_nodes, solved)}",
+        num_right=len(right),
         num_fixed=num_fixed,
+        rigid=num_fixed == num_nodes,
+        solve=None if solved is None else solved.facts,
+        edges=right,
         solved=solved,
     )
+
+
+def _say_certain(num_fixed: int, num_nodes: int, solved: SolverResult | None) -> str:
+    if num_fixed < num_nodes:
+        return f"fix {num_fixed:,} of {num_nodes:,} nodes, and too few of them hold the others"
+    if solved is None:
+        return "are parallel rigid"
+    certified = f"is certified to {max(solved.gap, 0.0):.1e}, but not to have one optimum"
+    if solved.converged and solved.unique is True:
+        certified = f"has one optimum, certified to {max(solved.gap, 0.0):.1e}: exact if their directions are"
+    return f"are parallel rigid, and the program restricted to them {certified}"

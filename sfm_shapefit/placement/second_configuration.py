@@ -31,7 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray, distinct
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -126,7 +126,7 @@ def find_fold(
     closing = rejected[triangles.log_odds[rejected] > 0.0]
     if len(closing) <= _MOST * len(rejected):
         return None
-    cameras, against = np.unique(graph.edges[closing]), int(inliers.sum())
+    cameras, against = distinct(graph.edges[closing]), int(inliers.sum())
     return SecondConfiguration(
         found=Found.BY_TRIANGLES, cameras=cameras, num_pairs=len(closing), num_against=against
     )

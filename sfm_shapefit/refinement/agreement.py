@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, quantile
 from sfm_shapefit.base.geometry import angle_between_deg, normalized, tangent_bases
 from sfm_shapefit.base.scipy_parts import chdtri
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -116,9 +116,9 @@ def _level(angles: FloatArray, num_unknowns: int, freedom: int) -> float:
     """Return the standard deviation per axis that the (m,) residual angles in radians speak of."""
     share, is_exact = _fitted_share(angles, num_unknowns, freedom)
     median_length = np.sqrt(chdtri(freedom, 0.5))  # median length of a vector of unit normal components
-    quantile = float(np.quantile(angles, (1.0 + share) / 2.0 if is_exact else 0.5))
+    usual = float(quantile(angles, (1.0 + share) / 2.0 if is_exact else 0.5))
     shrunk = 1.0 if is_exact else float(np.sqrt(1.0 - share))
-    return max(quantile / (shrunk * float(median_length)), _MIN_LEVEL_RAD)
+    return max(usual / (shrunk * float(median_length)), _MIN_LEVEL_RAD)
 
 
 def _excess(
@@ -153,7 +153,7 @@ def _matching_excess(squares: FloatArray, variances: FloatArray, rank: float, wa
 
     def too_large(excess: float) -> bool:
         chi2 = np.sum(squares / (np.maximum(variances, 0.0) + excess**2), axis=1)
-        return float(np.quantile(chi2, rank)) > wanted
+        return float(quantile(chi2, rank)) > wanted
 
     low, high = _MIN_LEVEL_RAD, np.pi
     if not too_large(low):

@@ -92,17 +92,20 @@ class _AnchoredTerms(AngularTerms):
         self._anchors, self._joined = anchors, _join(graph, anchors)
 
     def cost(self, t: FloatArray) -> float:
-        """Return the cost at t, (n, d)."""
-        kernels = 0.5 * KERNEL_WIDTH**2 * loss(ARCTANGENT, self._anchors.chi2(t) / KERNEL_WIDTH**2)
-        return super().cost(t) + float(np.sum(kernels))
+        return super().cost(t) + self._anchors_cost(t)
 
-    def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return blocks (m + k, d, d), damping (m + k,) and the right-hand side (n + 1, d)."""
-        blocks, damped, gradient = self.linearize(t)
+    def _anchors_cost(self, t: FloatArray) -> float:
+        kernels = 0.5 * KERNEL_WIDTH**2 * loss(ARCTANGENT, self._anchors.chi2(t) / KERNEL_WIDTH**2)
+        return float(np.sum(kernels))
+
+    def normal_equations(self, t: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+        """Return the cost, blocks (m + k, d, d), damping (m + k,) and the right-hand side (n + 1, d)."""
+        cost, blocks, damped, gradient = self.linearize(t)
         anchor_blocks = weighted_anchors(self._anchors, t).information
         pull = np.einsum("kab,kb->ka", anchor_blocks, self._anchors.off(t))
         right = -adjoint(np.concatenate([gradient, pull]), self._joined.edges, self._joined.num_nodes)
-        return np.concatenate([blocks, anchor_blocks]), np.append(damped, np.zeros(len(anchor_blocks))), right
+        cost, damped = cost + self._anchors_cost(t), np.append(damped, np.zeros(len(anchor_blocks)))
+        return cost, np.concatenate([blocks, anchor_blocks]), damped, right
 
     def move(self, t: FloatArray, step: FloatArray) -> FloatArray:
         """Return the locations (n, d) after a step (n + 1, d), with the origin where it is."""

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, quantile
 from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread, tangent_bases
@@ -132,11 +132,12 @@ def refine_angles(
     still = _STILL_PER_LEVEL if isinstance(plan, IterativeNormal) else 0.0
     moves_singly = isinstance(plan, FactorPlan | IterativeNormal)
     levels = np.full(int(classes.max()) + 1, _FIRST_LEVEL_RAD)
+    information = _information(graph, spread, levels[classes])
     while steps < _MAX_STEPS:
         lower = np.clip(residual_levels(measured, t, levels), levels / 2.0, levels)
         settled = bool((lower >= (1.0 - _SETTLED) * levels).all())
-        levels = levels if settled else lower
-        information = _information(graph, spread, levels[classes])
+        if not settled:
+            levels, information = lower, _information(graph, spread, lower[classes])
         terms = AngularTerms(graph, information, ARCTANGENT if settled else GEMAN_MCCLURE)
         moved, damping, before, after = take_angular_step(terms, factor, t, damping)
         is_still = (
@@ -147,7 +148,7 @@ def refine_angles(
             break
         if settled and other is not None and _is_decided(before, after, terms.cost(other)):
             break
-    terms = AngularTerms(graph, _information(graph, spread, levels[classes]))
+    terms = AngularTerms(graph, information)
     cost, first_cost = terms.cost(t), terms.cost(first)
     if first_cost < cost:
         t, cost = first, first_cost
@@ -175,17 +176,17 @@ class AngularTerms:
         """Return the sum of the kernel over the pairs at locations (n, d) of any scale."""
         return float(_sum_of_kernels(*self._arguments(t)))
 
-    def linearize(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the blocks of the normal matrix (m, d, d), of its damping (m,), and the gradient (m, d)."""
-        m, d = self._graph.directions.shape
+    def linearize(self, t: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+        """Return the cost, normal blocks (m, d, d), their damping (m,), and the gradient (m, d)."""
+        (m, d), arguments = self._graph.directions.shape, self._arguments(t)
         out = np.empty((m, d, d)), np.empty(m), np.empty((m, d))
-        _linearize_pairs(*self._arguments(t), out)
-        return out
+        _linearize_pairs(*arguments, out)
+        return float(_sum_of_kernels(*arguments)), *out
 
-    def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the blocks, those of the damping, and the right-hand side (n, d) of a step from t."""
-        blocks, damped, gradient = self.linearize(t)
-        return blocks, damped, -adjoint(gradient, self._graph.edges, self._graph.num_nodes)
+    def normal_equations(self, t: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+        """Return the cost, the blocks, the damping, and the right-hand side (n, d) of a step from t."""
+        cost, blocks, damped, gradient = self.linearize(t)
+        return cost, blocks, damped, -adjoint(gradient, self._graph.edges, self._graph.num_nodes)
 
     def move(self, t: FloatArray, step: FloatArray) -> FloatArray:
         """Return the locations (n, d) after a step from t."""
@@ -208,8 +209,7 @@ def take_angular_step(
     terms: AngularTerms, factor: LaplacianFactor, t: FloatArray, damping: float
 ) -> tuple[FloatArray, float, float, float]:
     """Take one step that lowers the cost; return locations, damping, and the cost before and after."""
-    before = terms.cost(t)
-    blocks, damped, right = terms.normal_equations(t)
+    before, blocks, damped, right = terms.normal_equations(t)
 
     def propose(damping: float) -> tuple[FloatArray, float] | None:
         try:
@@ -233,8 +233,13 @@ def fitting_pairs(measured: MeasuredGraph, locations: FloatArray, levels: FloatA
     return np.asarray(chi2 < KERNEL_WIDTH**2)
 
 
-def residual_levels(measured: MeasuredGraph, locations: FloatArray, levels: FloatArray) -> FloatArray:
-    """Return each class's level: median residual, own covariances included, inside the present kernel."""
+def residual_levels(
+    measured: MeasuredGraph, locations: FloatArray, levels: FloatArray, rounds: int = 1
+) -> FloatArray:
+    """Return each class's level: median residual, own covariances included, inside the present kernel.
+
+    In further rounds the kernel is that of the level before, until it stays.
+    """
     graph, classes = measured.graph, measured.classes
     freedom = graph.dimension - 1
     equations = freedom * graph.num_edges
@@ -242,13 +247,17 @@ def residual_levels(measured: MeasuredGraph, locations: FloatArray, levels: Floa
     fitted = max(1.0 - unknowns / equations, 0.3)  # least squares leaves this share of the variance
     median_length = np.sqrt(chdtri(freedom, 0.5) * fitted)  # with unit variance per axis
     chords = np.linalg.norm(_residuals(graph, unit_norm(locations)), axis=1)
-    new_levels = np.empty_like(levels)
-    for c, level in enumerate(levels):
-        class_chords = chords[classes == c]
-        inside = class_chords[class_chords < KERNEL_WIDTH * level]
-        few = len(inside) < _LEAST_SHARE * len(class_chords) or len(class_chords) == 0
-        new_levels[c] = level if few else np.median(inside) / median_length
-    return np.maximum(new_levels, _LEAST_LEVEL_RAD)
+    of_classes = [chords[classes == c] for c in range(len(levels))]
+    for _ in range(rounds):
+        before, levels = levels, levels.copy()
+        for c, class_chords in enumerate(of_classes):
+            inside = class_chords[class_chords < KERNEL_WIDTH * levels[c]]
+            if len(inside) >= _LEAST_SHARE * len(class_chords) and len(class_chords):
+                levels[c] = np.median(inside) / median_length
+        levels = np.maximum(levels, _LEAST_LEVEL_RAD)
+        if np.array_equal(levels, before):
+            break
+    return levels
 
 
 def information_at(measured: MeasuredGraph, levels: FloatArray) -> FloatArray:
@@ -299,7 +308,7 @@ def _within_reach(t: FloatArray) -> FloatArray:
 
 def _motion(t: FloatArray, moved: FloatArray) -> float:
     """Return the most that nine tenths of the nodes moved, over the extent; loose ones wander for long."""
-    return float(np.quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
+    return float(quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
 
 
 def _residuals(graph: ViewGraph, t: FloatArray) -> FloatArray:

@@ -339,18 +339,24 @@ class Mixture:
         baselines, v = differences(t, self._graph.edges), self._graph.directions
         lengths = np.linalg.norm(baselines, axis=1)
         unit = max(float(np.median(lengths)), _TINY)
-        floored = np.maximum(lengths / unit, _SHORTEST)
-        units = baselines / (unit * floored)[:, None]
-        angles = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(units - v, axis=1), 1.0))
-        along = np.einsum("edk,ed->ek", self._axes, units)
-        errors = along.copy()
-        sines = np.linalg.norm(errors, axis=1)
-        # Scaled to the angle, beyond 90 degrees too; straight behind, any axis will do.
-        behind = sines <= _TINY
-        errors[behind, 0], sines[behind] = 1.0, 1.0
         scaled = np.asarray((t - t.mean(axis=0)) / unit)
-        across = self._axes - units[:, :, None] * along[:, None, :]
-        return _Residuals(scaled, floored, units, across, errors * (angles / sines)[:, None])
+        errors, across = np.empty_like(self._own), np.empty_like(self._axes)
+        found = _Residuals(scaled, np.empty_like(lengths), np.empty_like(v), across, errors)
+
+        def job(of: slice) -> None:
+            floored = found.lengths[of] = np.maximum(lengths[of] / unit, _SHORTEST)
+            units = found.units[of] = baselines[of] / (unit * floored)[:, None]
+            angles = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(units - v[of], axis=1), 1.0))
+            along = np.einsum("edk,ed->ek", self._axes[of], units)
+            across[of] = self._axes[of] - units[:, :, None] * along[:, None, :]
+            sines = np.linalg.norm(along, axis=1)
+            # Scaled to the angle, beyond 90 degrees too; straight behind, any axis will do.
+            behind = sines <= _TINY
+            along[behind, 0], sines[behind] = 1.0, 1.0
+            errors[of] = along * (angles / sines)[:, None]
+
+        self._workers.run([partial(job, of) for of in self._chunks])
+        return found
 
     def _expect(
         self, expected: FloatArray, levels: Levels, floor: float, own: FloatArray | None = None
@@ -454,9 +460,11 @@ class Mixture:
 
     def _refactor(self, system: _System, damping: float) -> bool:
         """Factor the damped normal matrix; return whether it is positive definite."""
-        resisting = (damping * system.damping_unit)[:, None, None] * np.eye(system.blocks.shape[1])
+        blocks = system.blocks.copy()
+        for a in range(blocks.shape[1]):
+            blocks[:, a, a] += damping * system.damping_unit
         try:
-            self._factor.refactor(system.blocks + resisting)
+            self._factor.refactor(blocks)
         except UnsolvableError:
             return False
         return True

@@ -21,12 +21,12 @@ _ROUNDS = 10
 
 
 def stay_near(
-    measured: MeasuredGraph, solved: SolverResult, centers: FloatArray, first: RefinedPlacement
+    measured: MeasuredGraph, solved: SolverResult, centers: FloatArray, near: RefinedPlacement
 ) -> RefinedPlacement:
     """Return the locations of cameras that an adjustment has placed, and points where their rays meet.
 
     The centers (k, 3) are those of the cameras of a piece whose certified solution is given, in any scale and
-    from any origin, in the same axes; `first` is the placement that was adjusted.
+    from any origin, in the same axes; `near` is the placement that was adjusted.
     """
     graph, there = measured.graph, solved.locations[: len(centers)]
     size, locations = median_spread(there), solved.locations.copy()
@@ -35,19 +35,16 @@ def stay_near(
     is_lost = fit.scale * median_spread(centers) <= _COLLAPSED * size
     locations[: len(centers)] = centers if is_lost else fit.apply(centers)
     locations = normalize_locations(graph, follow_cameras(measured, locations))
-    levels = np.full(int(measured.classes.max()) + 1, OPENING_RAD)
-    for _ in range(_ROUNDS):
-        levels = residual_levels(measured, locations, levels)
-    return replace(
-        first,
-        locations=locations,
-        is_refined=True,
-        reason=f"{first.reason}; then adjusted to the pixels, rotations too",
+    opening = np.full(int(measured.classes.max()) + 1, OPENING_RAD)
+    levels = residual_levels(measured, locations, opening, _ROUNDS)
+    moved = near.moved_to(
+        locations,
+        np.empty(0, dtype=np.int64),
+        refined=True,
+        reason=f"{near.finish.reason}; then adjusted to the pixels, rotations too",
         levels_deg=tuple(np.degrees(levels).tolist()),
-        reset_nodes=np.empty(0, dtype=np.int64),
-        posterior=fit_mixture(measured, locations).posterior,
-        variances=None,
     )
+    return replace(moved, posterior=fit_mixture(measured, locations).posterior)
 
 
 def follow_cameras(part: MeasuredGraph, locations: FloatArray) -> FloatArray:

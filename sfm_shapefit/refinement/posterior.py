@@ -33,7 +33,7 @@ constraints", CVPR 2010; Pearl, "Probabilistic reasoning in intelligent systems"
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -77,8 +77,7 @@ class TriangleEvidence:
         return np.asarray(expit(self.log_odds + logit(self.prior)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Shapes:
+class _Shapes(NamedTuple):
     """The shapes of triangles, all of length k."""
 
     off_plane: FloatArray
@@ -97,14 +96,14 @@ def weigh_by_triangles(graph: ViewGraph, threads: int = 1) -> TriangleEvidence:
         return TriangleEvidence(log_odds=np.zeros(m), prior=0.5, num_triangles=0)
     shapes = _shapes(products)
     norms = _normalizers(d)
-    shares = _fit_shares(shapes, d, norms)
+    shares = _fit_shares(shapes, d, norms, threads)
     messages, log_odds = np.zeros((len(sides), 3)), np.zeros(m)
     prior = float(np.clip(np.cbrt(shares.sum()), *_PRIORS))
     shares = shares / shares.sum()
     above, rest = np.zeros(len(sides)), 1.0
     for rung, tau in enumerate(_RUNGS_RAD):
         level = rung - (len(_RUNGS_RAD) - len(_LEVELS_RAD))
-        ratio = _ratio(shapes, tau, d) * norms[rung]
+        ratio = _ratio(shapes, tau, d, threads) * norms[rung]
         last = rung == len(_RUNGS_RAD) - 1
         for _ in range(_LAST_SWEEPS // _SWEEPS if last else 1):
             weights = above + rest * ratio
@@ -150,10 +149,16 @@ def _shapes(products: FloatArray) -> _Shapes:
     )
 
 
-def _ratio(shapes: _Shapes, tau: float, dimension: int) -> FloatArray:
+def _ratio(shapes: _Shapes, tau: float, dimension: int, threads: int = 1) -> FloatArray:
     """Return rho(tau) of triangles, (k,), but for its normalizer."""
-    more = max(dimension - _SPACE, 0)
-    return _weighed_ratio(shapes, tau, dimension, _log_mean_power(more))
+    log_weight, ratio = _log_mean_power(max(dimension - _SPACE, 0)), np.empty(len(shapes.gap))
+
+    def fill(begin: int, end: int) -> None:
+        some = _Shapes(*(column[begin:end] for column in shapes))
+        ratio[begin:end] = _weighed_ratio(some, tau, dimension, log_weight)
+
+    in_ranges(threads if len(ratio) > _TRIANGLES_WORTH_THREADS else 1, len(ratio), fill)
+    return ratio
 
 
 def _weighed_ratio(
@@ -185,12 +190,14 @@ def _normalizers(dimension: int) -> FloatArray:
     return np.array([1.0 / np.mean(_weighed_ratio(shapes, tau, dimension, weights)) for tau in _RUNGS_RAD])
 
 
-def _fit_shares(shapes: _Shapes, dimension: int, norms: FloatArray) -> FloatArray:
+def _fit_shares(shapes: _Shapes, dimension: int, norms: FloatArray, threads: int) -> FloatArray:
     """Return the share of all triangles that is right and of each noise level."""
     step = max(len(shapes.gap) // _FIT_TRIANGLES, 1)
-    some = _Shapes(off_plane=shapes.off_plane[::step], sines=shapes.sines[::step], gap=shapes.gap[::step])
+    some = _Shapes(*(column[::step] for column in shapes))
     first = len(_RUNGS_RAD) - len(_LEVELS_RAD)
-    ratios = np.stack([_ratio(some, tau, dimension) * norms[first + k] for k, tau in enumerate(_LEVELS_RAD)])
+    ratios = np.stack(
+        [_ratio(some, tau, dimension, threads) * norms[first + k] for k, tau in enumerate(_LEVELS_RAD)]
+    )
     shares = np.full(len(ratios), 0.02)
     for _ in range(_FIT_ROUNDS):
         density = shares @ ratios + 1.0 - shares.sum()

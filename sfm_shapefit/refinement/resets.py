@@ -18,7 +18,7 @@ each tenfold radius is looked at by itself.
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import distances_in_spreads, fit_similarity_l1
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -76,7 +76,7 @@ def _find_drifting(
     agreed = np.bincount(ends[leaving & agreeing[:, None]], minlength=count)  # with the rest: else one group
     enough = (agreed >= _FEWEST_AGREEING) & (agreed > _LEAST_AGREEMENT * pairs)
     lost: BoolArray = far & ~enough[group]
-    for label in np.unique(group[far & enough[group]]).tolist():
+    for label in distinct(group[far & enough[group]]).tolist():
         members = np.flatnonzero(group == label)
         joining = np.flatnonzero((leaving & (ends == label)).any(axis=1) & agreeing)
         lost[members] = openness(refined, graph.edges[joining], members, noise_rad[joining]) > _OPEN_SHARE

@@ -10,13 +10,14 @@ over cameras, of the log ratio of their node lengths, which are medians of the l
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.factor import FactorPlan, LaplacianFactor
@@ -45,7 +46,7 @@ from sfm_shapefit.refinement.reweighted import (
 )
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.reduction import Reduction
-from sfm_shapefit.solver.solver_options import PAIRS_AT_SCALE, SolverResult
+from sfm_shapefit.solver.solver_options import PAIRS_AT_SCALE, Solve, SolverResult
 from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import Lud, solve_lud
 
@@ -97,35 +98,63 @@ class Rival:
     """Nats of evidence that the kept explanation has more, both at the noise of the noisier of the two."""
 
 
+class Finish(Record):
+    """From the certified optimum to the centers."""
+
+    start: Annotated[str, "The convex start that was kept."]
+    refined: Annotated[bool, "Whether the angular refinement moved the start."]
+    reason: Annotated[str, "Why this start was kept."]
+    disagreement: Annotated[float | None, "How far the two starts disagree about lengths, as a share."]
+    costs: Annotated[dict[str, float], "Robust angular cost of each start after refinement."]
+    levels_deg: Annotated[tuple[float, ...], "Level of the residuals, of pairs and of directions to points."]
+    moved_median: Annotated[
+        float,
+        "Median move of cameras and points from the start that is kept, as a share of their median distance "
+        "from the center.",
+    ]
+    moved_max: Annotated[float, "The largest such move."]
+    num_turned_pairs: Annotated[
+        int,
+        "Directions, those to points too, that fit the start and not the refined locations, or the other way "
+        "round.",
+    ]
+    num_put_back: Annotated[int, "Cameras that had left the scene and were put back."]
+    lud: Annotated[Lud | None, "The second start; null if it was not solved."]
+    reweighted: Annotated[
+        Solve | None,
+        "The program at the weights that are the pairs' posteriors, certified at these; null where the "
+        "cameras come from another start.",
+    ]
+
+    @property
+    def collapsed(self) -> bool:
+        """Whether the starts disagree so much that one of them must have collapsed."""
+        return self.disagreement is not None and self.disagreement > COLLAPSED
+
+    def statement(self) -> str:
+        """Say where the locations come from and what the refinement changed, in a sentence."""
+        if not self.refined:
+            return f"{self.start}, not refined: {self.reason}"
+        back = f"; {self.num_put_back} thrown out of the scene and put back" if self.num_put_back else ""
+        nodes = "cameras and points" if len(self.levels_deg) > 1 else "cameras"
+        return (
+            f"{self.start}, refined in angles ({nodes} moved by {self.moved_median:.2%} of the scene's "
+            f"radius, at most {self.moved_max:.2%}; {self.num_turned_pairs} directions of theirs went from "
+            f"agreeing to contradicting or back{back}): {self.reason}"
+        )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RefinedPlacement:
     """The locations that are kept, and why."""
 
     locations: FloatArray
     """(n, d) centered, scaled like the solver's."""
-    start: str
-    """The program they come from: "ShapeFit", "LUD" or "reweighted ShapeFit"."""
-    is_refined: bool
-    """Whether they differ from its optimum."""
-    reason: str
-    """Why this start, a sentence for the user."""
-    disagreement: float | None
-    """Standard deviation of the log ratio of node lengths between the two starts; None with one start."""
-    costs: dict[str, float]
-    """Robust cost of what each start led to, all at `levels_deg`; under a mixture, minus its evidence."""
-    levels_deg: tuple[float, ...]
-    """Noise level of each class of directions: between cameras, then to points; a mixture's median."""
-    moved: tuple[float, float]
-    """Median and largest move of a node by the refinement, as a share of the median distance from the
-    center."""
-    num_turned_pairs: int
-    """Directions, those to points too, that fit the start and not the refined locations, or the other way
-    round, at `levels_deg`."""
+    finish: Finish
+    """How they were found."""
     reset_nodes: IntArray
     """Nodes that the refinement moved far out, ascending; they are where LUD, or else the start, has them
     instead, and nothing says that they belong there."""
-    lud: Lud | None
-    """The second start, with its own dual bound (0 where that was not computed)."""
     posterior: FloatArray
     """(m,) probability that each direction is right, by its residual and those of all (`consensus`)."""
     reweighted: Reweighted | None
@@ -138,30 +167,16 @@ class RefinedPlacement:
     """What triangles say of the directions; None where nothing asked them, or they chose weights alone."""
 
     @property
-    def collapsed(self) -> bool:
-        """Whether the starts disagree so much that one of them must have collapsed."""
-        return self.disagreement is not None and self.disagreement > COLLAPSED
-
-    @property
     def right(self) -> BoolArray | None:
         """(m,) the directions that are taken for right; None where most of all are."""
         if self.variances is not None:
             return np.asarray(self.posterior > 0.5)
         return None if self.reweighted is None else np.asarray(self.posterior > 0.5)
 
-    def statement(self) -> str:
-        """Say where the locations come from and what the refinement changed, in a sentence."""
-        if not self.is_refined:
-            return f"{self.start}, not refined: {self.reason}"
-        median, largest = self.moved
-        num_reset = len(self.reset_nodes)
-        back = f"; {num_reset} thrown out of the scene and put back" if num_reset else ""
-        nodes = "cameras and points" if len(self.levels_deg) > 1 else "cameras"
-        return (
-            f"{self.start}, refined in angles ({nodes} moved by {median:.2%} of the scene's radius, at most "
-            f"{largest:.2%}; {self.num_turned_pairs} directions of theirs went from agreeing to "
-            f"contradicting or back{back}): {self.reason}"
-        )
+    def moved_to(self, locations: FloatArray, reset_nodes: IntArray, **finish: Any) -> Self:
+        """Return the same at other locations (n, d), for which the variances of directions do not hold."""
+        told = replace(self.finish, num_put_back=len(reset_nodes), **finish)
+        return replace(self, locations=locations, finish=told, reset_nodes=reset_nodes, variances=None)
 
 
 class _Problem(NamedTuple):
@@ -173,7 +188,7 @@ class _Problem(NamedTuple):
     second: FloatArray | None
     """(n, d) LUD's."""
     apart: float | None
-    """See `RefinedPlacement.disagreement`."""
+    """See `disagreement`."""
     threads: int
 
 
@@ -196,21 +211,27 @@ def refine_starts(
     threads = options.solver.num_threads()
     problem = _Problem(measured, normal_solver, solved.locations, second, apart, threads)
     kept = _find_most_evident(problem, options) or _find_best_fit(problem, options)
-    moved = _measure_moves(kept.start)
+    median, largest = _measure_moves(kept.start)
     # To the bit: the certificate is that of these very locations.
-    is_as_solved = kept.start.locations is solved.locations and moved[1] == 0.0
-    return RefinedPlacement(
-        locations=solved.locations if is_as_solved else normalize_locations(graph, kept.start.best),
+    is_as_solved = kept.start.locations is solved.locations and largest == 0.0
+    finish = Finish(
         start=kept.start.name,
-        is_refined=moved[1] > 0.0,
+        refined=largest > 0.0,
         reason=kept.reason,
         disagreement=apart,
         costs=kept.costs,
         levels_deg=tuple(np.degrees(kept.levels).tolist()),
-        moved=moved,
+        moved_median=median,
+        moved_max=largest,
         num_turned_pairs=_count_turned_pairs(measured, kept.start, kept.levels),
-        reset_nodes=kept.start.reset_nodes,
+        num_put_back=len(kept.start.reset_nodes),
         lud=lud,
+        reweighted=None if kept.reweighted is None else kept.reweighted.solved.facts,
+    )
+    return RefinedPlacement(
+        locations=solved.locations if is_as_solved else normalize_locations(graph, kept.start.best),
+        finish=finish,
+        reset_nodes=kept.start.reset_nodes,
         posterior=kept.posterior,
         reweighted=kept.reweighted,
         variances=kept.variances,
@@ -609,7 +630,7 @@ def choose_start(
 
 
 def _measure_moves(chosen: Start) -> tuple[float, float]:
-    """Return the median and the largest move by the refinement, see `RefinedPlacement.moved`."""
+    """Return the median and the largest move by the refinement, see `Finish`."""
     before, after = unit_norm(chosen.locations), unit_norm(chosen.best)
     moved = np.linalg.norm(after - before, axis=1) / median_spread(after)
     return float(np.median(moved)), float(moved.max())

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, quantile
 from sfm_shapefit.report.drawing import PairClass, Pairs
 
 _RANGE_DEG = (1e-3, 180.0)  # degrees from the first bin to the last; smaller residuals count in the first
@@ -19,8 +19,6 @@ _ERROR_BARS = 24  # bars of the reprojection errors; as many as are told apart a
 _ERROR_QUANTILE = 0.98  # quantile of the reprojection errors; all larger ones share the last bar
 MOST_CELLS = 200
 """Cells per side of the matrix; with more cameras, several share a cell."""
-_UNBINNED_RANK = np.array([1, 4, 2, 3])  # rank of each PairClass; a cell shows the worst of its pairs
-_NO_PAIR = 255  # byte of a cell without a pair; no rank comes near
 _TYPES = {"f4": np.float32, "i4": np.int32, "u2": np.uint16, "u1": np.uint8}
 
 
@@ -55,7 +53,7 @@ def reprojection_error_bars(errors_px: FloatArray) -> dict[str, Any] | None:
     known = errors_px[np.isfinite(errors_px)]
     if not len(known):
         return None
-    largest = max(float(np.quantile(known, _ERROR_QUANTILE)), 1e-6)
+    largest = max(float(quantile(known, _ERROR_QUANTILE)), 1e-6)
     power = 10.0 ** math.floor(math.log10(largest / _ERROR_BARS))
     width = next(part * power for part in (1, 2, 2.5, 5, 10) if part * power * _ERROR_BARS >= largest)
     bars = max(math.ceil(largest / width - 1e-9), 1)
@@ -100,25 +98,22 @@ def residual_histogram(residuals_deg: dict[str, FloatArray]) -> dict[str, Any]:
 def view_graph_matrix(pairs: Pairs, rank: IntArray) -> dict[str, Any]:
     """Return the symmetric matrix of pairs, of at most 200 x 200 cells, in the order of cameras.csv.
 
-    With one camera a cell, what became of its pair: 1 agrees, 2 undetermined, 3 no direction, 4 contradicts.
-    With several, how many pairs contradict the solution, and how many there are. The rows of the cameras on
-    the page are their `rank` (n,).
+    With several cameras a cell: how many pairs contradict the solution, and how many there are; with one, the
+    listed pairs are all pairs. The rows of the cameras on the page are their `rank` (n,).
     """
     per_cell = max(-(-len(rank) // MOST_CELLS), 1)
     side = -(-len(rank) // per_cell)
     known = {"side": side, "perCell": per_cell, "rowOf": pack_array(rank, "i4")}
+    if per_cell == 1:
+        return known
     i, j = (pairs.cameras // per_cell).T
     # A pair inside a cell counts once, any other in two cells.
-    inside = i == j
-    cells = np.concatenate([i, j[~inside]]), np.concatenate([j, i[~inside]])
-    classes = np.concatenate([pairs.classes, pairs.classes[~inside]])
-    if per_cell == 1:
-        worst = np.zeros((side, side), dtype=np.int64)
-        np.maximum.at(worst, cells, _UNBINNED_RANK[classes])
-        return known | {"cells": pack_array(np.where(worst > 0, worst, _NO_PAIR), "u1")}
-    against, counts = np.zeros((2, side, side), dtype=np.int64)
-    np.add.at(against, cells, classes == PairClass.CONTRADICTS)
-    np.add.at(counts, cells, 1)
+    cells = np.concatenate([i, j[i != j]]), np.concatenate([j, i[i != j]])
+    against = np.append(pairs.classes, pairs.classes[i != j]) == PairClass.CONTRADICTS
+    shown = {"against": against.astype(np.int64), "counts": np.ones(len(against), np.int64)}
     largest = np.iinfo(np.uint16).max
-    shown = {"against": against, "counts": counts}
-    return known | {name: pack_array(np.minimum(values, largest), "u2") for name, values in shown.items()}
+    for name, values in shown.items():
+        sums = np.zeros((side, side), dtype=np.int64)
+        np.add.at(sums, cells, values)
+        known[name] = pack_array(np.minimum(sums, largest), "u2")
+    return known

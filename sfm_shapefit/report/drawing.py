@@ -13,12 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, quantile
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.facts.rows import covariances_of
-from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting, rejected
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.report.lens_residuals import LensField
 from sfm_shapefit.scene.images import Images
 
 MAX_PAIRS = 20_000
@@ -43,6 +44,7 @@ class PairClass(enum.IntEnum):
     CONTRADICTS = 1
     UNDETERMINED = 2
     NO_DIRECTION = 3
+    REJECTED = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,7 +152,7 @@ class Pairs:
 
     def worst_first(self) -> IntArray:
         """Return the rows, those that contradict the solution most first, those without a direction last."""
-        rank = np.array([2, 0, 1, 3])[self.classes]
+        rank = np.array([2, 0, 1, 4, 3])[self.classes]
         return np.asarray(np.lexsort((-self.support, -np.nan_to_num(self.residuals_deg), rank)))
 
 
@@ -176,6 +178,8 @@ class Drawing:
     """Further figures of the cameras."""
     lenses: tuple[LensRow, ...] = ()
     """All lenses of the model."""
+    fields: tuple[LensField, ...] = ()
+    """Mean residuals over the pictures of those with most images."""
 
     def shifts(self) -> FloatArray:
         """(n,) how far cameras stand from where the input has them; NaN where the two cannot be compared."""
@@ -315,8 +319,9 @@ def _pairs(rows: Table[PairRow], cameras: Cameras, certified: FloatArray | None)
     ends = np.array([[row_of[name] for name in columns[end]] for end in ("name1", "name2")], dtype=np.int64).T
     directions, undetermined = columns["direction"], columns["verdict"] == Verdict.UNDETERMINED.value
     is_known = np.isfinite(directions).all(axis=1)
-    kinds = PairClass.NO_DIRECTION, PairClass.UNDETERMINED, PairClass.CONTRADICTS
-    classes = np.select([~is_known, undetermined, contradicting(rows)], kinds, PairClass.AGREES)
+    kinds = PairClass.REJECTED, PairClass.NO_DIRECTION, PairClass.UNDETERMINED, PairClass.CONTRADICTS
+    of_kind = [~is_known & rejected(rows), ~is_known, undetermined, contradicting(rows)]
+    classes = np.select(of_kind, kinds, PairClass.AGREES)
     return Pairs(
         cameras=ends,
         classes=classes.astype(np.int64),
@@ -354,7 +359,7 @@ def _points(picked: PickedPoints | None, cameras: FloatArray) -> PickedPoints:
         return PickedPoints(nothing, nothing.astype(np.uint8), np.zeros(0, np.int64), np.zeros(0), 0)
     both = np.concatenate([picked.xyz, cameras])
     middle = np.median(both, axis=0)
-    limit = _FAR_POINT * np.quantile(np.linalg.norm(both - middle, axis=1), 0.9)
+    limit = _FAR_POINT * quantile(np.linalg.norm(both - middle, axis=1), 0.9)
     near = np.linalg.norm(picked.xyz - middle, axis=1) <= limit
     errors_px = np.where(picked.errors_px >= 0.0, picked.errors_px, np.nan)
     return picked._replace(xyz=picked.xyz[near], colors=picked.colors[near], errors_px=errors_px)
@@ -364,7 +369,7 @@ def _frustum_depth(positions: FloatArray) -> float:
     """Return how deep frusta are drawn: well below the distance between neighbors."""
     if len(positions) < 2:
         return 1.0
-    low, high = np.quantile(positions, [0.05, 0.95], axis=0)
+    low, high = quantile(positions, 0.05), quantile(positions, 0.95)
     extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
     some = positions[:: max(len(positions) // _MEASURED, 1)]
     apart = [np.partition(np.linalg.norm(positions - own, axis=1), 1)[1] for own in some]

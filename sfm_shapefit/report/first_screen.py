@@ -88,7 +88,8 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
             f"{drawing.noun} stands out."
         )
     if facts.verdict.grade is not Grade.LOOK or not facts.verdict.cameras:
-        return f"{reasons}." if reasons else ""
+        named = f"; look at {_named(facts.verdict.cameras)}" if facts.verdict.cameras else ""
+        return f"{reasons}{named}." if reasons else ""
     placed = set(np.array(drawing.cameras.names)[drawing.cameras.placed].tolist())
     doubted = [name for name in facts.verdict.cameras if name in placed]
     left_out = [name for name in facts.verdict.cameras if name not in placed]

@@ -12,6 +12,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.report.drawing import MAX_PAIRS, Cameras, Pairs
+from sfm_shapefit.scene.epipolar import sampson_errors_px
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, View, rows_of_pairs
 
@@ -83,14 +84,11 @@ def _draw(
 def _sampson_px(batch: MatchBatch, images: Images) -> FloatArray:
     """Return how far matches (M,) are from the epipolar lines, to first order, in pixels of both pictures.
 
-    Cameras at one place have no such lines; their matches have NaN. As `tracks.joining.sampson_px`.
+    Cameras at one place have no such lines; their matches have NaN.
     """
     baselines = images.centers[batch.pairs[:, 1]] - images.centers[batch.pairs[:, 0]]
-    directions = batch.spread(normalized(baselines))
-    along = [np.sum(rays * directions, axis=1) for rays in (batch.rays_i, batch.rays_j)]
-    volumes = np.abs(np.sum(np.cross(batch.rays_i, batch.rays_j) * directions, axis=1))
-    gradients = np.sqrt(np.maximum(2.0 - along[0] ** 2 - along[1] ** 2, 1e-12))
-    return np.asarray(volumes / (gradients * batch.spread(batch.pixel_angles)))
+    directions, angles = batch.spread(normalized(baselines)), batch.spread(batch.pixel_angles)
+    return sampson_errors_px(batch.rays_i, batch.rays_j, directions, angles)
 
 
 def _most_telling(counts: IntArray, cameras: IntArray, num_cameras: int) -> IntArray:

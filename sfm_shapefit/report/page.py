@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, quantile
 from sfm_shapefit.base.record import plain
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.command_options import LocateOptions, MapOptions
@@ -37,7 +37,7 @@ from sfm_shapefit.report.charts import (
     track_length_bars,
     view_graph_matrix,
 )
-from sfm_shapefit.report.drawing import MAX_PAIRS, MAX_POINTS, Drawing, input_centers
+from sfm_shapefit.report.drawing import MAX_PAIRS, MAX_POINTS, Drawing, PairClass, input_centers
 from sfm_shapefit.report.first_screen import banner, scene_name, tiles
 from sfm_shapefit.report.matched import DrawnMatches
 from sfm_shapefit.report.sentences import MAX_TEXT, Hint, first_looks, shorten, summary_sentences
@@ -48,6 +48,17 @@ _MAX_HINGES = 20  # hinges named per piece; locate.json has all
 _STARTING_ITERATIONS = 2  # iterations left out of the chart; their objectives may be far out of scale
 _MAX_ROWS = 200  # control points, lenses and loops listed, of each; locate.json has all
 _AXES = "xyz"
+_PAIRS_WORDS = (
+    "A pair agrees or contradicts as a whole, by its direction; single matches fit or miss. pairs.csv says "
+    "inlier and outlier; an outlier that is off by less than a degree agrees here."
+)
+_COLORS = {
+    PairClass.AGREES: "blue agrees",
+    PairClass.CONTRADICTS: "red contradicts",
+    PairClass.REJECTED: "violet is rejected",
+    PairClass.UNDETERMINED: "yellow cannot be judged",
+    PairClass.NO_DIRECTION: "gray has no direction",
+}
 # In the order in which they make one script.
 _SCRIPTS = ("core.js", "scene.js", "view.js", "tables.js", "charts.js", "page.js")
 
@@ -146,6 +157,7 @@ def page_data(
         "reasons": [shorten(text) for text in reasons],
         "sceneNote": _scene_note(drawing),
         "pairsNote": _pairs_note(drawing),
+        "pairsWords": _PAIRS_WORDS if np.any(drawing.pairs.support > 0) else "",
         "hasSupport": bool(np.any(drawing.pairs.support > 0)),
         "highTrust": _HIGH_TRUST,
         "minTrust": float(facts.options.get("min_trust", 0.0)),
@@ -156,6 +168,16 @@ def page_data(
         "convergence": _convergence(drawing),
         "notes": _notes(drawing, residuals_deg),
         "lenses": [[shorten(cell) for cell in lens] for lens in drawing.lenses[:_MAX_ROWS]],
+        "fields": [
+            {
+                "label": shorten(field.label),
+                "aspect": field.aspect,
+                "places": pack_array(field.places, "f4"),
+                "means": pack_array(field.means_px, "f4"),
+                "statement": field.statement,
+            }
+            for field in drawing.fields
+        ],
         "intrinsics": _cells(facts, "intrinsics", lambda lens: -abs(lens.change)),
         "control": _cells(facts, "control_points", lambda point: -(point.error or 0.0)),
         "bars": _cells(facts, "scale_bars", lambda bar: -abs(bar.error_sigmas or 0.0)),
@@ -358,7 +380,7 @@ def _notes(drawing: Drawing, residuals_deg: Mapping[str, FloatArray]) -> dict[st
         "tracks": _tracks_note(drawing.points),
         "reprojection": _reprojection_note(drawing.points),
         "trust": _trust_note(drawing),
-        "matrix": _matrix_note(-(-len(drawing.cameras.names) // MOST_CELLS)),
+        "matrix": _matrix_note(drawing),
         "support": _support_note(drawing),
         "convergence": _convergence_note(drawing),
         "loops": "Pairs far apart in their order are used where the images between agree.",
@@ -403,7 +425,7 @@ def _reprojection_note(points: PickedPoints) -> str:
     known = points.errors_px[np.isfinite(points.errors_px)]
     if not len(known):
         return ""
-    median, high = np.quantile(known, [0.5, 0.9])
+    median, high = quantile(known, 0.5), quantile(known, 0.9)
     return (
         f"Mean error of a 3D point over the images that see it: {median:.2g} px in the median, "
         f"{high:.2g} px or less for nine of ten.{_sample(points)}"
@@ -416,10 +438,14 @@ def _sample(points: PickedPoints) -> str:
     return f" Counted over {len(points.lengths):,} points, evenly picked."
 
 
-def _matrix_note(cameras_per_cell: int) -> str:
+def _matrix_note(drawing: Drawing) -> str:
+    cameras_per_cell = -(-len(drawing.cameras.names) // MOST_CELLS)
     if cameras_per_cell > 1:
         return f"{cameras_per_cell} cameras share a cell; the redder it is, the more of its pairs contradict."
-    return "Blue agrees, red contradicts, yellow cannot be judged, gray has no direction."
+    most = int(drawing.pairs.support.max(initial=0))
+    strength = f" The stronger the color, the more matches fit the pair (up to {most:,})." if most else ""
+    told = [name for kind, name in _COLORS.items() if np.any(drawing.pairs.classes == kind)]
+    return f"{', '.join(told).capitalize()}.{strength}"
 
 
 def _support_note(drawing: Drawing) -> str:

@@ -12,9 +12,11 @@ from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Table
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
+from sfm_shapefit.files.colmap.points import structure_of
 from sfm_shapefit.files.colmap.seed import pick_points
 from sfm_shapefit.judgement.image_quality import ImageQuality
 from sfm_shapefit.report.drawing import MAX_POINTS, CameraColumn, Drawing, LensRow, build_drawing, poses_of
+from sfm_shapefit.report.lens_residuals import lens_fields
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 
@@ -40,6 +42,7 @@ def draw_result(found: LocateResult | GraphResult) -> Drawing:
         input_is_aligned=isinstance(found, LocateResult) and found.gauge.scale == "input",
         history=tuple((info.iteration, info.objective, info.dual_bound) for info in placement.history),
         lenses=_lenses(found.images) if isinstance(found, LocateResult) else (),
+        fields=lens_fields(found.seed.structure) if isinstance(found, LocateResult) else (),
     )
 
 
@@ -73,7 +76,11 @@ def _draw_as_it_stands(model: ColmapModel, cameras: Table[CameraRow], pairs: Tab
     poses = poses_of(model.images, list(cameras.columns["name"]))
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
     points = pick_points(model.arrays, MAX_POINTS)
-    return replace(build_drawing(cameras, pairs, poses=poses, points=points), lenses=_lenses(model.images))
+    return replace(
+        build_drawing(cameras, pairs, poses=poses, points=points),
+        lenses=_lenses(model.images),
+        fields=lens_fields(structure_of(model.arrays, model.images)),
+    )
 
 
 def _lenses(images: Images) -> tuple[LensRow, ...]:
@@ -91,7 +98,7 @@ def _lens_row(lens: Lens, num_images: int) -> LensRow:
         f"{lens.width} x {lens.height}",
         ", ".join(f"{value:,.1f}" for value in focal),
         ", ".join(f"{value:,.1f}" for value in point),
-        ", ".join(f"{value:.4g}" for value in distortion),
+        ", ".join(f"{value:.4g}" for value in distortion) or "none",
     )
 
 

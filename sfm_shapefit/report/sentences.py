@@ -71,7 +71,8 @@ def first_looks(drawing: Drawing, facts: Facts) -> list[Hint]:
     if facts.verdict.grade is Grade.GOOD:  # what is of note there is no task; the banner counts the pairs
         return [hint for hint in _warnings(drawing, facts, set()) if _OF_PAIRS not in hint.text]
     cameras = [*_left_out(drawing), *_least_trusted(drawing), *_weak(drawing, facts)]
-    warnings = list(_warnings(drawing, facts, {hint.camera for hint in cameras}))
+    found = _warnings(drawing, facts, {hint.camera for hint in cameras})
+    warnings = sorted(found, key=lambda hint: hint.camera is not None and not hint.of_several)
     told = {hint.camera for hint in [*warnings, *cameras] if not hint.of_several}
     return _one_of_each_camera(
         drawing,
@@ -115,13 +116,16 @@ def placed_sentence(drawing: Drawing) -> str:
 
 def _pairs(drawing: Drawing) -> str:
     counts = np.bincount(drawing.pairs.classes, minlength=len(PairClass)).tolist()
-    against = counts[PairClass.CONTRADICTS]
+    agree, against = counts[PairClass.AGREES], counts[PairClass.CONTRADICTS]
     text = (
-        f"Of {len(drawing.pairs.classes):,} pairs, {counts[PairClass.AGREES]:,} agree with the "
+        f"Of {len(drawing.pairs.classes):,} pairs, {agree:,} {'agrees' if agree == 1 else 'agree'} with the "
         f"placed {drawing.noun}s and {against:,} {'contradicts' if against == 1 else 'contradict'} them"
     )
     if counts[PairClass.UNDETERMINED]:
         text += f"; {counts[PairClass.UNDETERMINED]:,} cannot be judged"
+    if counts[PairClass.REJECTED]:
+        count = counts[PairClass.REJECTED]
+        text += f"; {count:,} {_are(count)} rejected, as most of their matches contradict the rotations"
     if counts[PairClass.NO_DIRECTION]:
         has = "has" if counts[PairClass.NO_DIRECTION] == 1 else "have"
         text += f"; {counts[PairClass.NO_DIRECTION]:,} {has} no usable direction"
@@ -224,7 +228,7 @@ def _set_aside(drawing: Drawing, against: IntArray) -> Hint:
     """Say how many pairs contradict the placed cameras, and whose they are."""
     pairs, count = drawing.pairs, len(against)
     verb = "contradicts" if count == 1 else "contradict"
-    judged = int(np.sum(pairs.classes != PairClass.NO_DIRECTION))
+    judged = int(np.sum(~np.isin(pairs.classes, [PairClass.NO_DIRECTION, PairClass.REJECTED])))
     text = f"{count:,} of {judged:,} pairs {verb} the placed {drawing.noun}s"
     if np.isfinite(drawing.cameras.trust).any():
         text += f" and {_are(count)} set aside"

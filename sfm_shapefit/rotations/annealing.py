@@ -51,7 +51,6 @@ SCALE_OF_MEDIAN = 3.0
 """Width of the loss with the full information; in medians of the Mahalanobis lengths."""
 # Triangles that close to within about this angle count as closed.
 _CLOSING_SCALE = np.radians(AGREEMENT_DEG)
-_PAIRS_PER_SLICE = 200_000  # pairs; Python can be interrupted between slices
 _VOTING_SCALE = np.radians(10.0)  # radians; predictions of a rotation within about this vote for each other
 # A camera moves only for so much more votes: by less, two could move for one another for ever.
 _MARGIN = 0.05
@@ -150,11 +149,10 @@ def _triangle_votes(
     """Return the votes (k,) of the triangles of each pair that close, and of all; see `close_triangles`."""
     graph, k = system.graph, len(given.pairs)
     closing, all_votes = np.empty(k), np.empty(k)
-    for begin in range(0, k, _PAIRS_PER_SLICE):
-        close_triangles(
-            begin, min(begin + _PAIRS_PER_SLICE, k), graph.pointers, graph.neighbors, graph.edge_of,
-            given.pairs, given.measured, weights, float(_CLOSING_SCALE), closing, all_votes,
-        )  # fmt: skip
+    system.over_pairs(
+        close_triangles, graph.pointers, graph.neighbors, graph.edge_of, given.pairs, given.measured, weights,
+        float(_CLOSING_SCALE), closing, all_votes,
+    )  # fmt: skip
     return closing, all_votes
 
 
@@ -162,11 +160,12 @@ def anneal(given: AveragingPairs, system: AveragingSystem, turns: FloatArray, wi
     """Return rotations (n, 4) after rounds of a robust loss that narrows from `widest`, in radians."""
     turns, k = turns.copy(), len(given.pairs)
     weights = np.sqrt(given.supports / given.supports.mean())
-    robust, gradient = np.empty(k), np.empty((given.num_cameras, 3))
+    robust, pulls = np.empty(k), np.empty((k, 3))
     for step in range(_ROUNDS):
         tau = max(widest * _COOLING**step, float(_COLDEST))
-        reweigh_pairs(given.pairs, given.measured, turns, weights, tau, robust, gradient)
-        turned = turn_cameras(turns, system.solve_scalar(robust, gradient, _REDUCTION), LONGEST_STEP)
+        system.over_pairs(reweigh_pairs, given.pairs, given.measured, turns, weights, tau, robust, pulls)
+        steps = system.solve_scalar(robust, system.gradient_of(pulls), _REDUCTION)
+        turned = turn_cameras(turns, steps, LONGEST_STEP)
         if tau <= _COLDEST and turned <= SETTLED:
             break
     return turns
@@ -205,7 +204,7 @@ def reattach_blocks(
 def _find_blocks(given: AveragingPairs, system: AveragingSystem, turns: FloatArray) -> IntArray:
     """Return the block of each camera (n,), the largest one as the last; see `reattach_blocks`."""
     squares = np.empty(len(given.pairs))
-    residual_squares(given.pairs, given.measured, turns, squares)
+    system.over_pairs(residual_squares, given.pairs, given.measured, turns, squares)
     agrees = squares <= _COLDEST**2
     _, votes = _triangle_votes(given, system, agrees.astype(np.float64))
     block_of = connected_components(given.num_cameras, given.pairs[agrees & (votes > 0.0)])
@@ -234,21 +233,13 @@ def refine_fully(
 ) -> tuple[FloatArray, Linearized]:
     """Return rotations (n, 4) after rounds with the full information, and the system at the answer."""
     turns, k = turns.copy(), len(given.pairs)
-    distances, blocks = np.empty(k), np.empty((k, 3, 3))
-    gradient = np.empty((given.num_cameras, 3))
+    distances, blocks, pulls = np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3))
 
     def weigh(scale: float) -> float:
-        weigh_blocks(
-            given.pairs,
-            given.measured,
-            turns,
-            given.information,
-            FULL_LIMIT,
-            scale,
-            distances,
-            blocks,
-            gradient,
-        )
+        system.over_pairs(
+            weigh_blocks, given.pairs, given.measured, turns, given.information, FULL_LIMIT, scale, distances,
+            blocks, pulls,
+        )  # fmt: skip
         inside = distances[~np.isnan(distances)]
         return max(SCALE_OF_MEDIAN * float(np.median(inside)) if len(inside) else 1.0, 1e-12)
 
@@ -256,7 +247,8 @@ def refine_fully(
     scale = weigh(scale)
     for step in range(rounds):
         tol = LAST_REDUCTION if step == rounds - 1 else _REDUCTION
-        turned = turn_cameras(turns, system.solve_blocks(blocks, gradient, tol), LONGEST_STEP)
+        steps = system.solve_blocks(blocks, system.gradient_of(pulls), tol)
+        turned = turn_cameras(turns, steps, LONGEST_STEP)
         scale = weigh(scale)
         if turned <= SETTLED:
             break

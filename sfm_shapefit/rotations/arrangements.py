@@ -38,7 +38,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, quantile
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
@@ -93,7 +93,7 @@ def _usual_shares(angles_deg: FloatArray, shares: FloatArray) -> FloatArray:
     order = np.argsort(angles_deg, kind="stable")
     width = min(_NUM_ALIKE, len(order))
     windows = np.lib.stride_tricks.sliding_window_view(shares[order], width)
-    quantiles = np.quantile(windows, _USUAL_QUANTILE, axis=1)
+    quantiles = quantile(windows.T, _USUAL_QUANTILE)
     first = np.clip(np.arange(len(order)) - width // 2, 0, len(quantiles) - 1)
     usual = np.empty(len(order))
     usual[order] = quantiles[first]

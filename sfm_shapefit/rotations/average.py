@@ -252,7 +252,7 @@ def _agreeing(given: AveragingPairs, answer: _Answer) -> BoolArray:
     turns = np.full((given.num_cameras, 4), np.nan)
     turns[answer.members] = answer.turns
     squares = np.empty(len(given.pairs))
-    residual_squares(given.pairs, given.measured, turns, squares)
+    residual_squares(0, len(squares), given.pairs, given.measured, turns, squares)
     return np.asarray(squares <= np.radians(AGREEMENT_DEG) ** 2)
 
 

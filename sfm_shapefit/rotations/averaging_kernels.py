@@ -87,26 +87,33 @@ def _multiply_on_right(q: Any, s0: float, s1: float, s2: float) -> None:
 
 @kernel
 def reweigh_pairs(
-    pairs: Any, measured: Any, turns: Any, weights: Any, scale: float, robust: Any, gradient: Any
-) -> None:
-    """Fill robust weights (k,), weights / (1 + (|x| / scale)^2)^2, and the gradient D^T W x (n, 3)."""
-    x = np.empty(3)
-    gradient[:] = 0.0
-    for e in range(len(pairs)):
-        i, j = pairs[e, 0], pairs[e, 1]
-        square = _world_residual(measured[e], turns[i], turns[j], x)
+    begin: int, end: int, pairs: Any, measured: Any, turns: Any, weights: Any, scale: float, robust: Any,
+    pulls: Any,
+) -> None:  # fmt: skip
+    """Fill robust weights W (k,), weights / (1 + (|x| / scale)^2)^2, and W x (k, 3), from begin to end."""
+    for e in range(begin, end):
+        square = _world_residual(measured[e], turns[pairs[e, 0]], turns[pairs[e, 1]], pulls[e])
         w = weighed(GEMAN_MCCLURE, weights[e], square / (scale * scale))
         robust[e] = w
         for c in range(3):
-            gradient[i, c] -= w * x[c]
-            gradient[j, c] += w * x[c]
+            pulls[e, c] *= w
 
 
 @kernel
-def residual_squares(pairs: Any, measured: Any, turns: Any, squares: Any) -> None:
-    """Fill the squared residual angles (k,); NaN where a camera has no rotation."""
-    x = np.empty(3)
+def add_at_ends(pairs: Any, rows: Any, sign: float, at_first: Any, at_second: Any) -> None:
+    """Add rows (k, d) to sums (n, d) at their second cameras, and `sign` times them at their first ones."""
     for e in range(len(pairs)):
+        i, j = pairs[e, 0], pairs[e, 1]
+        for c in range(rows.shape[1]):
+            at_first[i, c] += sign * rows[e, c]
+            at_second[j, c] += rows[e, c]
+
+
+@kernel
+def residual_squares(begin: int, end: int, pairs: Any, measured: Any, turns: Any, squares: Any) -> None:
+    """Fill the squared residual angles of the pairs begin..end-1; NaN where a camera has no rotation."""
+    x = np.empty(3)
+    for e in range(begin, end):
         squares[e] = _world_residual(measured[e], turns[pairs[e, 0]], turns[pairs[e, 1]], x)
 
 
@@ -126,22 +133,23 @@ def _turn_information(h: Any, q: Any, r: Any, hr: Any, block: Any) -> None:
 
 @kernel
 def weigh_blocks(
-    pairs: Any, measured: Any, turns: Any, information: Any, limit: float, scale: float,
-    distances: Any, blocks: Any, gradient: Any,
+    begin: int, end: int, pairs: Any, measured: Any, turns: Any, information: Any, limit: float, scale: float,
+    distances: Any, blocks: Any, pulls: Any,
 ) -> None:  # fmt: skip
-    """Fill Mahalanobis lengths (k,), robust blocks w R_j^T H R_j (k, 3, 3), and the gradient D^T B x (n, 3).
+    """Fill Mahalanobis lengths (k,), robust blocks B = w R_j^T H R_j (k, 3, 3), and B x (k, 3).
 
-    Pairs whose residual angle is beyond `limit`, in radians, have the length NaN and the block 0.
+    They are those of the pairs begin..end-1. A pair whose residual angle is beyond `limit`, in radians, has
+    the length NaN and the block 0.
     """
     x, r, hr, hx, half = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(4)
-    gradient[:] = 0.0
-    for e in range(len(pairs)):
+    for e in range(begin, end):
         i, j = pairs[e, 0], pairs[e, 1]
         square = _world_residual(measured[e], turns[i], turns[j], x)
         block = blocks[e]
         if square > limit * limit:
             distances[e] = np.nan
             block[:] = 0.0
+            pulls[e] = 0.0
             continue
         for a in range(4):
             half[a] = turns[j, a]
@@ -156,8 +164,7 @@ def weigh_blocks(
         loss = 1.0 + (length / scale) * (length / scale)
         w = 1.0 / (loss * loss)
         for a in range(3):
-            gradient[i, a] -= w * hx[a]
-            gradient[j, a] += w * hx[a]
+            pulls[e, a] = w * hx[a]
             for b in range(3):
                 block[a, b] *= w
 

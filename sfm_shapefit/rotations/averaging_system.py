@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, sum_by
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.laplacian.approximate import (
     JacobiPreconditioner,
     Preconditioner,
@@ -25,7 +26,7 @@ from sfm_shapefit.laplacian.approximate import (
 from sfm_shapefit.laplacian.factor import Factor, FactorPlan, allocate_factor, analyze
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order, widest_level
-from sfm_shapefit.rotations.averaging_kernels import apply_blocks
+from sfm_shapefit.rotations.averaging_kernels import add_at_ends, apply_blocks
 
 RIDGE = 1e-9
 """Share of the mean diagonal that is added to it; holds cameras whose pairs are all left out."""
@@ -39,6 +40,7 @@ _MANY_NODES = 3_000  # nodes; more are worth ordering only if a diagonal is no g
 _JACOBI_STEPS = 12  # steps; a graph that a diagonal solves in so few is an expander
 _STALE_STEPS = 25  # steps; a preconditioner that takes more is made anew for the next system
 _MAX_STEPS = 300  # conjugate gradient steps; a bound
+_SLICE = 5_000  # pairs that one thread takes; Python can be interrupted between slices
 _SEED = 1  # seed of the preconditioner; same input, same answer
 
 
@@ -62,6 +64,19 @@ class AveragingSystem:
     """By the size of their blocks."""
     _operator: LaplacianOperator | None = None
     _preconditioner: Preconditioner | None = None
+
+    def over_pairs(self, work: Callable[..., object], *given: object) -> None:
+        """Call `work(begin, end, *given)` for slices of the pairs, each of which it fills, in threads."""
+        count = len(self.pairs)
+        cuts = [(begin, min(begin + _SLICE, count)) for begin in range(0, count, _SLICE)]
+        for _ in in_threads(min(self.threads, len(cuts)), lambda cut: work(*cut, *given), cuts):
+            pass
+
+    def gradient_of(self, pulls: FloatArray) -> FloatArray:
+        """Return D^T of what pulls at the pairs, (k, 3), at their cameras, (n, 3)."""
+        gradient = np.zeros((self.num_nodes, 3))
+        add_at_ends(self.pairs, pulls, -1.0, gradient, gradient)
+        return gradient
 
     def solve_scalar(self, weights: FloatArray, right: FloatArray, tol: float) -> FloatArray:
         """Return the solution (n, 3) for weights (k,), without factor to `tol` of the right side."""
@@ -98,8 +113,9 @@ class AveragingSystem:
     def sum_at_nodes(self, blocks: FloatArray) -> FloatArray:
         """Return the sums (n, b, b) of the blocks (k, b, b) of the pairs at their two nodes."""
         rows = blocks.reshape(len(blocks), -1)
-        sums = sum(sum_by(ends, rows, self.num_nodes) for ends in self.pairs.T)
-        return np.asarray(sums).reshape(-1, *blocks.shape[1:])
+        sums = np.zeros((2, self.num_nodes, rows.shape[1]))
+        add_at_ends(self.pairs, rows, 1.0, *sums)
+        return np.asarray(sums[0] + sums[1]).reshape(-1, *blocks.shape[1:])
 
     def ground_blocks(self, blocks: FloatArray) -> Factor:
         """Return the factor of the Laplacian of blocks without ridge, grounded at its last node."""
@@ -121,9 +137,9 @@ class AveragingSystem:
         """Factor the matrix of blocks (k, b, b); UnsolvableError if it is not positive definite."""
         b = blocks.shape[1]
         factor, diagonal = self._factor_of(b), self.sum_at_nodes(blocks)
-        entries = diagonal[:, range(b), range(b)]
-        diagonal[:, range(b), range(b)] += RIDGE * entries.mean()
-        if not factor.refactor_blocks(self.pairs, diagonal, -blocks):
+        entries = diagonal.reshape(-1, b * b)[:, :: b + 1]
+        entries += RIDGE * np.ascontiguousarray(entries.T).mean()
+        if not factor.refactor_alike(diagonal, blocks):
             raise UnsolvableError("the pairs do not determine the rotations to working precision")
 
     def _scalar_operator(self, weights: FloatArray) -> LaplacianOperator:

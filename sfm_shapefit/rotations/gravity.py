@@ -138,13 +138,13 @@ def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Re
     turns = np.concatenate([turns, [[0.0, 0.0, 0.0, 1.0]]])
     system = plan_system(graph.num_cameras, graph.pairs, np.sqrt(graph.supports), 1)
     k, m = len(graph.pairs), len(gravity.indices)
-    distances, blocks, gradient = np.empty(k), np.empty((k, 3, 3)), np.empty((graph.num_cameras, 3))
+    distances, blocks, pulls = np.empty(k), np.empty((k, 3, 3)), np.empty((k, 3))
 
     def weigh(scale: float) -> float:
         graph.measured[k - m :] = _follow(turns, gravity)
-        weigh_blocks(
-            graph.pairs, graph.measured, turns, graph.information, float(_LIMIT), scale, distances, blocks,
-            gradient,
+        system.over_pairs(
+            weigh_blocks, graph.pairs, graph.measured, turns, graph.information, float(_LIMIT), scale,
+            distances, blocks, pulls,
         )  # fmt: skip
         inside = distances[: k - m][~np.isnan(distances[: k - m])]
         median = float(np.median(inside)) if len(inside) else 1.0
@@ -152,7 +152,8 @@ def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Re
 
     scale = weigh(weigh(SCALE_OF_MEDIAN))
     for _ in range(_ROUNDS):
-        turned = turn_cameras(turns, system.solve_blocks(blocks, gradient, LAST_REDUCTION), LONGEST_STEP)
+        steps = system.solve_blocks(blocks, system.gradient_of(pulls), LAST_REDUCTION)
+        turned = turn_cameras(turns, steps, LONGEST_STEP)
         scale = weigh(scale)
         if turned <= SETTLED:
             break
@@ -168,8 +169,8 @@ def _join_world(given: AveragingPairs, turns: FloatArray, gravity: Gravity) -> A
     n, k, m = given.num_cameras, len(given.pairs), len(gravity.indices)
     distances, limit = np.empty(k), float(np.radians(AGREEMENT_DEG))
     weigh_blocks(
-        given.pairs, given.measured, turns, given.information, limit, 1.0, distances, np.empty((k, 3, 3)),
-        np.empty((n, 3)),
+        0, k, given.pairs, given.measured, turns, given.information, limit, 1.0, distances,
+        np.empty((k, 3, 3)), np.empty((k, 3)),
     )  # fmt: skip
     agreeing = given.subset(~np.isnan(distances))
     # On average, of a connected graph.

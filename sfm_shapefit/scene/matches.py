@@ -9,7 +9,7 @@ matters of a keypoint is the unit ray of its pixel in world axes. So there are t
 
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, TypeVar
@@ -22,9 +22,10 @@ from sfm_shapefit.base.arrays import (
     FloatArray,
     IntArray,
     UInt32Array,
+    distinct,
     hand_back_memory,
 )
-from sfm_shapefit.base.executors import Advance, made_ahead, nobody
+from sfm_shapefit.base.executors import Advance, Answer, nobody, overlapped
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
 from sfm_shapefit.scene.images import Images
@@ -239,7 +240,6 @@ class View:
         min_matches: int = 1,
         without: IntArray | None = None,
         advance: Advance = nobody,
-        threads: int = 1,
     ) -> Iterator[MatchBatch]:
         """Yield the matches with rays in world axes, in batches; few matches are kept with these.
 
@@ -247,7 +247,6 @@ class View:
             min_matches: pairs with fewer are left out.
             without: (m, 2) pairs that are left out, too, whatever the order of their images.
             advance: hears of the pairs that are done, while batches are consumed, and of their number.
-            threads: if several, another one makes the next batch while a batch is consumed.
 
         Raises:
             InputError: as `Matches.read`.
@@ -260,9 +259,13 @@ class View:
         found = self._batches(np.flatnonzero(wanted), min_matches)
         if self.reading.keeps and self.num_matches <= KEPT_MATCHES and without is None:
             found = iter(self._kept.setdefault(min_matches, list(found)))
-        elif self.reading.keeps:
-            found = made_ahead(threads, found)
         return self._tell(found, advance)
+
+    def measured(
+        self, batches: Iterator[MatchBatch], measure: Callable[[MatchBatch], Answer], threads: int
+    ) -> Iterator[Answer]:
+        """Yield what is measured of batches, see `overlapped`; where memory is short, of one at a time."""
+        return overlapped(threads if self.reading.keeps else 1, measure, batches)
 
     def links(
         self,
@@ -311,7 +314,7 @@ class View:
         """Return all pairs, in their order, in parts of about equally many matches; see `Matches.parts`."""
         totals = offsets_of(self._counts)
         count = max(-(-int(totals[-1]) // max(max_matches, 1)), 1)
-        bounds = np.unique(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
+        bounds = distinct(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
         bounds[-1] = len(totals) - 1
         return self.matches.parts(self, [slice(*ends) for ends in itertools.pairwise(bounds.tolist())])
 
@@ -326,7 +329,7 @@ class View:
 
     def _batches(self, chosen: IntArray, min_matches: int) -> Iterator[MatchBatch]:
         for found in self._links(chosen, min_matches):
-            self._keep_rays(np.unique(found.pairs))
+            self._keep_rays(distinct(found.pairs))
             rows = found.spread(self._begins[found.pairs]) + found.keypoints
             yield MatchBatch(
                 pairs=found.pairs,
@@ -346,7 +349,7 @@ class View:
 
     def _keypoint_batch(self, chosen: IntArray, min_matches: int) -> KeypointMatches:
         pairs = self.pairs[chosen]
-        all_see = all(self._blind_of(image) is None for image in np.unique(pairs).tolist())
+        all_see = all(self._blind_of(image) is None for image in distinct(pairs).tolist())
         counts, keypoints = self.matches.read(self.rows[chosen], keep=self.reading.keeps)
         if not all_see:
             has_ray = np.ones(len(keypoints), dtype=np.bool_)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, stable_order
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
 from sfm_shapefit.scene.matches import KeypointMatches
@@ -91,7 +91,7 @@ class Points(Lists):
         new = new[np.unique(begins[new[:, 1]] + new[:, 2], return_index=True)[1]]
         new = new[np.unique(new[:, :2], axis=0, return_index=True)[1]]
         points = np.append(self.points_seen(), new[:, 0])
-        order = np.argsort(points, kind="stable")
+        order = stable_order(points)
         return replace(
             self,
             offsets=offsets_of(np.bincount(points, minlength=self.num_points)),

@@ -14,7 +14,7 @@ baselines.
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import normalized
@@ -59,7 +59,7 @@ def largest_tied(
         inside = np.isin(ends[:, 0], members)
         nodes, renumbered = np.unique(used[inside], return_inverse=True)
         part = groups.restricted_to(nodes)
-        names = np.unique(groups.group_of[nodes])
+        names = distinct(groups.group_of[nodes])
         motions = _null_motions(renumbered.reshape(-1, 2), part, locations[nodes])
         tied = names[_largest_alike(motions, sizes[names])]
         if sizes[tied].sum() > sizes[best].sum():

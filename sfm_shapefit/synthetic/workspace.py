@@ -101,7 +101,6 @@ def compact_database(path: Path) -> None:
 
 
 def _write_images(scene: Scene, database: pycolmap.Database) -> None:
-    """Write cameras, rigs, frames, images and keypoints."""
     cameras, made = models.new_rigs(scene.rigs, _camera(scene))
     images, frames = models.new_images(scene.rigs, [np.empty((0, 2))] * scene.num_images)
     for camera in cameras:

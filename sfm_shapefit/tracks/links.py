@@ -6,12 +6,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, Int32Array, IntArray
-from sfm_shapefit.base.executors import in_ranges
+from sfm_shapefit.base.arrays import (
+    BoolArray,
+    FloatArray,
+    IndexArray,
+    Int32Array,
+    IntArray,
+    stable_order,
+)
+from sfm_shapefit.base.executors import gathered, in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
-from sfm_shapefit.tracks.joining import number_trees, sampson_px, write_ray
+from sfm_shapefit.scene.epipolar import sampson_px, write_ray
+from sfm_shapefit.tracks.joining import number_trees
 
 # Between two slices Python can be interrupted: about 200 ms. For each all keypoints are counted.
 _MATCHES_A_SLICE = 4_000_000
@@ -132,20 +140,19 @@ class MatchedKeypoints:
             _join(self.matches[first : first + _MATCHES_A_SLICE], given, parents, threads)
         track = number_trees(parents, np.arange(len(parents), dtype=np.int32))
         del parents  # before what orders the keypoints, which is larger
-        rows, lengths = np.argsort(track, kind="stable"), np.bincount(track)
+        rows, lengths = stable_order(track), np.bincount(track)
         del track
         rows, lengths = rows[np.repeat(lengths > 1, lengths)], lengths[lengths > 1]
         return RowLists(offsets_of(lengths), rows)
 
-    def observed(self, joined: RowLists) -> ObservedTracks:
+    def observed(self, joined: RowLists, threads: int = 1) -> ObservedTracks:
         """Return tracks that are known by their rows."""
-        rows = joined.rows
         return ObservedTracks(
             offsets=joined.offsets,
-            cameras=self.cameras[rows],
-            keypoints=self.keypoints[rows],
-            pixels=self.pixels[rows],
-            on_plane=self.on_plane[rows],
+            cameras=gathered(threads, self.cameras, joined.rows),
+            keypoints=gathered(threads, self.keypoints, joined.rows),
+            pixels=gathered(threads, self.pixels, joined.rows),
+            on_plane=gathered(threads, self.on_plane, joined.rows),
             ids=np.arange(len(joined.offsets) - 1),
         )
 
@@ -158,7 +165,6 @@ def _join(matches: npt.NDArray[np.integer], given: Any, parents: Int32Array, thr
 
 @kernel
 def _merge(matches: Any, chosen: Any, parents: Any) -> None:
-    """Join the keypoints of the chosen matches."""
     for m in range(len(matches)):
         if chosen[m]:
             merge_sets(parents, matches[m, 0], matches[m, 1])

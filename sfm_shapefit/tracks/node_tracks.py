@@ -23,15 +23,16 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, stable_order
 from sfm_shapefit.base.forests import merge_sets, root_of
 from sfm_shapefit.base.jit import kernel, mix_bits
 from sfm_shapefit.base.lists import Lists, offsets_of
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
+from sfm_shapefit.scene.epipolar import sampson_px
 from sfm_shapefit.scene.matches import MatchBatch
-from sfm_shapefit.tracks.joining import number_trees, sampson_px
+from sfm_shapefit.tracks.joining import number_trees
 
 # Observations per camera; about 3 tracks started per camera, of 6 views each, determine a straight road.
 _PER_CAMERA = 20
@@ -208,7 +209,7 @@ def _collect(places: Int32Array, begins: IntArray, parents: IntArray, rays: Floa
     seen = places[keypoints].astype(np.int64)
     camera = np.searchsorted(begins, keypoints, side="right") - 1
     track = number_trees(parents, seen)[seen]
-    order = np.argsort(track, kind="stable")  # each track by ascending camera, as keypoints are
+    order = stable_order(track)  # each track by ascending camera, as keypoints are
     track, camera, seen = track[order], camera[order], seen[order]
     lengths = np.bincount(track)
     repeated = np.zeros(len(lengths), dtype=np.bool_)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import IntArray, UInt64Array
+from sfm_shapefit.base.arrays import IntArray, UInt64Array, quantile
 from sfm_shapefit.base.jit import kernel, mix_bits
 
 _LONG = 6  # views; longer tracks come no earlier, see the header
@@ -59,7 +59,7 @@ def _longest(lengths: IntArray) -> float:
     """Return the length beyond which a track is far longer than the others."""
     if lengths.max(initial=0) <= _MAYBE_JOINED:
         return np.inf
-    return max(_MAYBE_JOINED, _FAR_LONGER * float(np.quantile(lengths, 0.9)))
+    return max(_MAYBE_JOINED, _FAR_LONGER * float(quantile(lengths, 0.9)))
 
 
 def _draw(offsets: IntArray, pixels: npt.NDArray[np.floating]) -> UInt64Array:

@@ -26,7 +26,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.lists import RowLists, offsets_of
-from sfm_shapefit.tracks.joining import write_ray
+from sfm_shapefit.scene.epipolar import write_ray
 from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTracks
 
 # Observations between which Python can be interrupted: about 0.1 s.
@@ -163,7 +163,7 @@ def triangulate_matches(
         is_left = np.ones(len(rows), dtype=np.bool_)
         is_left[seen.rows] = False
     tracks = _concatenate([seen for _, seen in parts])
-    return matched.observed(tracks), TriangulatedPoints(
+    return matched.observed(tracks, threads), TriangulatedPoints(
         points=np.concatenate([points for points, _ in parts]),
         tracks=np.arange(len(tracks.offsets) - 1),
         points_seen=tracks.spread(np.arange(len(tracks.offsets) - 1, dtype=np.int32)),
@@ -187,14 +187,13 @@ def _triangulate_joined(
     points, seen = list[FloatArray](), list[RowLists]()
     for tracks in pairwise([0, *cuts, len(joined.offsets) - 1]):
         own = joined.subset(np.arange(*tracks))
-        found = triangulate_tracks(matched.observed(own), poses, limits, threads)
+        found = triangulate_tracks(matched.observed(own, threads), poses, limits, threads)
         points.append(found.points)
         seen.append(own.of(RowLists.by_label(found.points_seen, len(found.points))))
     return np.concatenate(points), _concatenate(seen)
 
 
 def _concatenate(parts: Sequence[RowLists]) -> RowLists:
-    """Return the lists of all parts."""
     lengths = np.concatenate([part.lengths() for part in parts])
     return RowLists(offsets_of(lengths), np.concatenate([part.rows for part in parts]))
 

@@ -1,11 +1,12 @@
 """Work is shared out in order, a few tasks ahead of the answers, and what is not needed is cancelled."""
 
 from concurrent.futures import ThreadPoolExecutor
-from threading import Event, get_ident
+from threading import Barrier, Event, get_ident
 
+import numpy as np
 import pytest
 
-from sfm_shapefit.base.executors import Crew, in_ranges, in_threads, made_ahead
+from sfm_shapefit.base.executors import Crew, gathered, in_ranges, in_threads, overlapped
 
 
 def square(number):
@@ -45,20 +46,38 @@ def test_ranges_fill_each_item_once(threads, count):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_one_item_is_made_while_another_is_used(threads):
+def test_answers_come_in_order_and_no_more_than_one_task_is_ahead(threads):
     made = []
-    for k in made_ahead(threads, (made.append(k) or k for k in range(20))):
+    squares = overlapped(threads, square, (made.append(k) or k for k in range(20)))
+    for k, found in enumerate(squares):
+        assert found == k**2
         assert len(made) <= k + threads
     assert made == list(range(20))
 
     def failing():
         yield 1
+        yield 2
         raise ValueError("damaged")
 
-    items = made_ahead(threads, failing())
-    assert next(items) == 1
+    answers = overlapped(threads, square, failing())
+    assert next(answers) == 1
     with pytest.raises(ValueError, match="damaged"):
-        next(items)
+        list(answers)
+
+
+def test_two_tasks_are_in_work_at_once_where_there_are_threads():
+    both = Barrier(2)  # of which neither ends before the other has begun
+    waits = overlapped(2, lambda _: both.wait(timeout=60), range(4))
+    assert len(list(waits)) == 4
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_gathered_rows_are_those_of_the_array(threads):
+    array, rows = np.arange(30, dtype=np.int32).reshape(10, 3), np.array([9, 0, 0, 4])
+    found = gathered(threads, array, rows)
+    assert found.dtype == array.dtype
+    np.testing.assert_array_equal(found, array[rows])
+    assert gathered(threads, array, rows[:0]).shape == (0, 3)
 
 
 def test_tasks_are_made_only_a_few_ahead_of_the_answers():

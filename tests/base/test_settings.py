@@ -241,7 +241,7 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
     assert solved.converged
     assert repr(solved).startswith("<SolverResult: 12 locations, converged")
     placed = sfm_shapefit.place(problem.view_graph, refine=False)
-    assert (placed.refined.is_refined, placed.certified.converged) == (False, True)
+    assert (placed.refined.finish.refined, placed.certified.converged) == (False, True)
     assert repr(placed).startswith("<PlacedGraph: good: 12 of 12 nodes placed, 0 of")
     located.timings_s["<script>"] = 1.0
     table = located._repr_html_()

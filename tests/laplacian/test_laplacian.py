@@ -1,5 +1,7 @@
 """Sparse linear algebra of graph Laplacians, against scipy's matrices and its splu."""
 
+import threading
+import time
 import tracemalloc
 from itertools import pairwise
 
@@ -308,6 +310,7 @@ def test_threads_change_no_bit_of_a_factor_with_tasks_and_strips(divided, dtype)
     rhs = balanced_rhs((plan.num_nodes, 3), 2)
     factors = [allocate_factor(plan, 1, dtype, threads=threads) for threads in (1, 2, 3)]
     for factor in factors:
+        factor.refactor(w[::-1])  # a factor is used again and again
         factor.refactor(w)
     for factor in factors[1:]:
         assert factor.smallest_pivot == factors[0].smallest_pivot
@@ -360,6 +363,25 @@ def test_workers_run_jobs_once_those_that_they_need_have_ended(threads):
     with pytest.raises(ValueError, match="job 12"):
         Workers(threads).run_after([job(k) for k in range(20)], needs)
     assert not {k for k in range(20) if 12 in needs[k]} & {*done}
+
+
+def test_a_failure_ends_threads_that_wait_for_what_will_not_come():
+    def fail():
+        time.sleep(0.05)  # the other thread waits by now
+        raise ValueError("job 0")
+
+    failures = []
+
+    def run():
+        try:
+            Workers(2).run_after([fail, fail], [[], [0]])
+        except ValueError as failure:
+            failures.append(str(failure))
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(60.0)  # else it would wait for ever
+    assert failures == ["job 0"]
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])

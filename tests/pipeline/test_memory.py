@@ -185,7 +185,7 @@ def test_locate_keeps_a_limit_or_names_the_one_that_can_be_kept_and_a_large_one_
     limits = (needed + 30, 9000, 0)
     found, limited, usual = (sfm_shapefit.locate(workspaces[kind], max_memory_mb=limit) for limit in limits)
     assert len(found.placement.cameras) == len(usual.placement.cameras)
-    assert found.placement.refined.is_refined
+    assert found.placement.refined.finish.refined
     assert np.isfinite(found.placement.assessment.sigmas).all()
     np.testing.assert_array_equal(limited.placement.locations, usual.placement.locations)
     assert limited.warnings == usual.warnings
@@ -232,6 +232,6 @@ def test_what_is_given_up_is_what_the_warning_says(workspaces, kind):
         )
         assert found.placement.measured.evidence.errors is None  # the largest arrays are not kept
         assert ("not adjusted" in statement) == (found.adjustment is None)
-        assert ("neither refined" in statement) == (not found.placement.refined.is_refined)
+        assert ("neither refined" in statement) == (not found.placement.refined.finish.refined)
     else:
         pytest.fail("no limit was refused")

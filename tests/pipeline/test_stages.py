@@ -50,7 +50,6 @@ from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.fixed_and_rigged import find_fixed_and_rigged
 from sfm_shapefit.placement.gauge_rule import GaugeRule
 from sfm_shapefit.placement.move import move_cameras
-from sfm_shapefit.placement.place import InitialPlacement
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.tracks.structure_options import NodeOptions
 from tests.models import centers_of, only, posed
@@ -327,7 +326,9 @@ def test_judge_takes_errors_from_a_first_placement_in_the_scale_of_the_cameras_t
         first = SimpleNamespace(
             images=TRUTH.part(rows), covariances=known, lens_errors=None, scale_sigma=None
         )
-        after = judge_piece(replace(state, near=InitialPlacement(before, None), first=first), Clock())
+        after = judge_piece(
+            replace(state, near=replace(state.placement.refined, locations=before), first=first), Clock()
+        )
         bare = judge_piece(state, Clock())
     np.testing.assert_allclose(after.judged.adjusted_covariances[rows], known / 40.0**2, rtol=1e-9)
     assert np.isnan(after.judged.adjusted_covariances[5]).all()

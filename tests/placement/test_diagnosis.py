@@ -110,7 +110,7 @@ def test_the_plan_is_what_a_placement_does_and_says_what_becomes_of_the_starts(m
     plan, done = diagnose(graph, options).plan, place(graph, options)
     assert plan.solver == done.certified.method
     assert done.certified.method_reason.startswith(plan.solver_reason)
-    assert plan.second_start == (done.refined.lud is not None)
+    assert plan.second_start == (done.refined.finish.lud is not None)
     said = {
         "better is kept, refined": PlacementOptions(),
         "better is kept, unrefined": PlacementOptions(refine=False),

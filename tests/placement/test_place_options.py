@@ -52,15 +52,15 @@ OPTIONS = {
     ),
     "factor_memory_mb": (
         NO_FACTOR,
-        lambda found, _: not found.refined.is_refined and np.isnan(found.assessment.sigmas).all(),
+        lambda found, _: not found.refined.finish.refined and np.isnan(found.assessment.sigmas).all(),
     ),
     # The answer does not depend on it, by contract.
     "threads": (2, lambda found, usual: np.array_equal(found.locations, usual.locations)),
     "objective": (
         "lud",
-        lambda found, _: found.refined.start == "LUD" and "as asked" in found.refined.reason,
+        lambda found, _: found.refined.finish.start == "LUD" and "as asked" in found.refined.finish.reason,
     ),
-    "refine": (False, lambda found, usual: usual.refined.is_refined and not found.refined.is_refined),
+    "refine": (False, lambda found, usual: usual.refined.finish.refined and not found.refined.finish.refined),
 }
 REFUSED_BY_GROUPS = {
     "solver": "no solver admm",
@@ -97,8 +97,8 @@ def test_the_conic_solver_knows_groups():
 @pytest.mark.parametrize("kind", ["rigs", "fixed"])
 def test_groups_are_placed_without_the_refinement_where_only_its_factor_would_be_too_large(kind):
     found = place(measure(kind), solver="conic", factor_memory_mb=0)  # LUD's takes no limit
-    assert not found.refined.is_refined
-    assert "the factor for that would be too large" in found.refined.reason
+    assert not found.refined.finish.refined
+    assert "the factor for that would be too large" in found.refined.finish.reason
 
 
 def test_iterations_are_recorded_told_and_can_be_cancelled(usual):

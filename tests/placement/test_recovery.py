@@ -44,7 +44,7 @@ def test_a_fifth_of_wrong_directions_costs_less_than_8_percent(family):
     placement = place(problem.view_graph)
     best = shape_error(oracle(problem), problem.locations)
     assert len(placement.cameras) == len(problem.locations)
-    assert not placement.refined.collapsed
+    assert not placement.refined.finish.collapsed
     assert shape_error(placement.locations, problem.locations) <= 1.08 * best  # measured 1.02 to 1.04
     assert shape_error(placement.certified.locations, problem.locations) > 1.5 * best
 
@@ -94,9 +94,9 @@ def test_a_large_graph_without_order_is_refined_without_a_factor():
     many = synthetic.random_graph_problem(1420, 22 / 1420, sigma=0.015, q=0.1, seed=1)
     placed = place(many.view_graph)
     refined = placed.refined
-    assert refined.lud is not None
-    assert list(refined.costs) == ["ShapeFit"]
-    assert 0.01 < refined.disagreement < 0.1  # below 1,500 cameras or so both would be refined
-    assert refined.is_refined
+    assert refined.finish.lud is not None
+    assert list(refined.finish.costs) == ["ShapeFit"]
+    assert 0.01 < refined.finish.disagreement < 0.1  # below 1,500 cameras or so both would be refined
+    assert refined.finish.refined
     ours, start = (shape_error(t, many.locations) for t in (placed.locations, placed.certified.locations))
     assert ours < 0.7 * start

@@ -168,7 +168,8 @@ def test_the_linearisation_is_that_of_the_cost_above_and_below_the_shortest_leng
     t[1] = t[0] + 0.8 * floor * np.array([0.6, 0.0, 0.8])
     information = information_at(MeasuredGraph(graph), np.array([0.05]))
     terms = AngularTerms(graph, information, kind)
-    _, _, per_edge = terms.linearize(t)
+    cost, _, _, per_edge = terms.linearize(t)
+    assert cost == terms.cost(t)
     gradient = angular.adjoint(per_edge, graph.edges, 12)
     h = 1e-9
     for camera, axis in [(0, 0), (1, 2), (5, 1)]:
@@ -221,6 +222,10 @@ def test_each_class_finds_its_own_level_and_keeps_it_while_it_is_not_fitted():
     assert found.levels_rad == pytest.approx([0.01, 0.001], rel=0.15)
     together = shape_error(refined(graph, problem.locations).locations, problem.locations)
     assert shape_error(found.locations, problem.locations) < 0.9 * together
+    levels = opening = np.array([0.1, 0.1])
+    for _ in range(3):
+        levels = residual_levels(measured, found.locations, levels)
+    np.testing.assert_array_equal(residual_levels(measured, found.locations, opening, 3), levels)
     nowhere = rng.standard_normal((60, 3))
     assert residual_levels(MeasuredGraph(graph), nowhere, np.array([0.01])) == pytest.approx(0.01)
 

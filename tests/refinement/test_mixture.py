@@ -73,14 +73,14 @@ def test_exact_directions_are_recovered_exactly_and_told_from_wrong_ones(d, q):
     assert shape_error(found.locations, problem.locations) < 1e-9
     np.testing.assert_array_equal(found.refined.posterior > 0.5, ~problem.corrupted)
     np.testing.assert_array_equal(found.agreement.agrees, ~problem.corrupted)
-    assert "by a mixture of noise levels" in found.refined.reason
+    assert "by a mixture of noise levels" in found.refined.finish.reason
 
 
 def test_an_end_that_explains_no_pair_does_not_lead():
     problem = synthetic.random_graph_problem(60, 0.5, q=0.82, seed=8)  # its usual start ends so
     found = place(problem.view_graph)
     assert shape_error(found.locations, problem.locations) < 1e-9
-    assert found.refined.start == "reweighted ShapeFit"
+    assert found.refined.finish.start == "reweighted ShapeFit"
 
 
 def test_a_street_of_uneven_noise_is_placed_about_as_well_as_by_its_right_pairs_alone():
@@ -108,7 +108,7 @@ def test_four_equal_sides_are_folded_by_the_usual_way_and_not_by_evidence(seed):
     assert shape_error(rival.end.locations, truth) > 0.5
     assert rival.behind > 100.0
     assert rival.end.right_share < found.refined.posterior.mean()
-    assert "at weights that are the pairs' posteriors" in found.refined.reason
+    assert "at weights that are the pairs' posteriors" in found.refined.finish.reason
 
 
 def test_the_posterior_tells_right_pairs_from_wrong_ones_and_standard_deviations_are_true(on_street):
@@ -187,7 +187,7 @@ def test_rigid_groups_and_few_cameras_are_placed_the_usual_way():
         with no_mixture():
             usual = place(graph)
         np.testing.assert_array_equal(found.locations, usual.locations)
-        assert found.refined.reason == usual.refined.reason
+        assert found.refined.finish.reason == usual.refined.finish.reason
         assert found.refined.variances is None
 
 
@@ -273,7 +273,7 @@ def test_standard_deviations_are_those_of_the_errors_where_pairs_differ_in_noise
 def test_starts_that_lead_to_one_place_are_followed_there_once():
     problem = synthetic.random_graph_problem(60, 0.4, sigma=0.01, q=0.3, seed=1)
     found = place(problem.view_graph)
-    assert len(set(found.refined.costs.values())) == 1 < len(found.refined.costs)
+    assert len(set(found.refined.finish.costs.values())) == 1 < len(found.refined.finish.costs)
     assert found.refined.rivals == ()
 
 

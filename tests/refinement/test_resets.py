@@ -113,7 +113,7 @@ def test_cameras_without_a_right_pair_stay_in_the_scene():
         assert shape_error(locations[:loose], problem.locations[:loose]) < 0.01
     assert by_mixture.assessment.trust[loose:].max() < 0.05
     assert len(found.reset_nodes) > 0
-    assert f"{len(found.reset_nodes)} thrown out of the scene and put back" in found.statement()
+    assert f"{len(found.reset_nodes)} thrown out of the scene and put back" in found.finish.statement()
 
 
 def test_a_sound_graph_has_no_strays_and_says_how_many_pairs_changed_sides():
@@ -122,16 +122,18 @@ def test_a_sound_graph_has_no_strays_and_says_how_many_pairs_changed_sides():
     with no_mixture():
         found = refine_starts(MeasuredGraph(graph), solve(graph), PlacementOptions())
     assert len(found.reset_nodes) == 0
-    start = solve(graph).locations if found.start == "ShapeFit" else found.lud.locations
+    start = solve(graph).locations if found.finish.start == "ShapeFit" else found.finish.lud.locations
     before, after = (
         np.linalg.norm(normalized(differences(t, graph.edges)) - graph.directions, axis=1)
-        < KERNEL_WIDTH * np.radians(found.levels_deg[0])
+        < KERNEL_WIDTH * np.radians(found.finish.levels_deg[0])
         for t in (start, found.locations)
     )
-    assert found.num_turned_pairs == np.sum(before != after) > 0
-    assert f"{found.num_turned_pairs} directions of theirs went from agreeing" in found.statement()
+    assert found.finish.num_turned_pairs == np.sum(before != after) > 0
+    assert (
+        f"{found.finish.num_turned_pairs} directions of theirs went from agreeing" in found.finish.statement()
+    )
     unrefined = refine_starts(MeasuredGraph(graph), solve(graph), PlacementOptions(refine=False))
-    assert (unrefined.num_turned_pairs, len(unrefined.reset_nodes)) == (0, 0)
+    assert (unrefined.finish.num_turned_pairs, len(unrefined.reset_nodes)) == (0, 0)
 
 
 def test_openness_is_the_error_that_triangulation_makes_at_any_scale_from_either_end():

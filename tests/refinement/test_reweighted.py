@@ -39,7 +39,7 @@ def recovered(hopeless):
 def test_recovery_is_exact_where_the_usual_starts_collapse(d, q):
     problem = corrupted(q, d)
     found = place(problem.view_graph)
-    assert found.refined.start == "reweighted ShapeFit"
+    assert found.refined.finish.start == "reweighted ShapeFit"
     assert shape_error(found.locations, problem.locations) < 1e-9
     np.testing.assert_array_equal(found.refined.posterior > 0.5, ~problem.corrupted)
     for usual in ("shapefit", "lud"):
@@ -69,13 +69,13 @@ def test_the_certificate_is_that_of_the_program_at_the_weights_and_that_is_said(
     believed = kept.graph.weights > 0.5
     assert np.mean(believed[hopeless.corrupted]) < 0.01
     assert np.mean(believed[~hopeless.corrupted]) > 0.99
-    assert "at weights that are the pairs' posteriors" in refined.statement()
+    assert "at weights that are the pairs' posteriors" in refined.finish.statement()
 
 
 def test_a_graph_that_is_explained_is_left_alone_and_so_is_an_objective_that_was_asked_for(hopeless):
     assert place(corrupted(0.2, sigma=0.02).view_graph).refined.reweighted is None
     assert place(corrupted(0.4, sigma=0.02).view_graph).refined.reweighted is None  # all rays meet
-    assert place(hopeless.view_graph, objective="shapefit").refined.start == "ShapeFit"
+    assert place(hopeless.view_graph, objective="shapefit").refined.finish.start == "ShapeFit"
 
 
 def test_starts_of_many_pairs_are_solved_to_less_than_the_last_digit_unless_that_is_asked():
@@ -91,7 +91,7 @@ def test_a_camera_of_a_single_right_pair_stays_in_the_scene():
     right, wrong = (np.flatnonzero(is_own & (problem.corrupted == bad)) for bad in (False, True))
     kept = np.sort(np.concatenate([np.flatnonzero(~is_own), right[:1], wrong[:2]]))
     found = place(graph.subset(kept))
-    assert found.refined.start == "reweighted ShapeFit"
+    assert found.refined.finish.start == "reweighted ShapeFit"
     others = np.arange(graph.num_nodes) != 7
     assert shape_error(found.locations[others], problem.locations[others]) < 1e-6
     distances = np.linalg.norm(found.locations, axis=1)

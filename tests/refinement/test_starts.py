@@ -42,19 +42,19 @@ def expander():
 
 def test_shapefit_collapses_on_a_long_chain_and_the_placement_does_not(chain):
     found = finished(chain)  # the families of test_recovery are placed by this start, where they collapse
-    assert found.disagreement > COLLAPSED
-    assert "disagree" in found.reason
-    assert found.statement().startswith("LUD, refined in angles")
+    assert found.finish.disagreement > COLLAPSED
+    assert "disagree" in found.finish.reason
+    assert found.finish.statement().startswith("LUD, refined in angles")
     assert shape_error(found.locations, chain.locations) < 0.05
-    assert found.costs["LUD"] < found.costs["ShapeFit"]
+    assert found.finish.costs["LUD"] < found.finish.costs["ShapeFit"]
 
 
 def test_where_both_starts_agree_nothing_is_said_of_a_collapse_and_the_scale_is_the_solvers(expander):
     graph, found = expander.view_graph, finished(expander)
-    assert not found.collapsed
-    assert "not by a collapse" in found.reason
+    assert not found.finish.collapsed
+    assert "not by a collapse" in found.finish.reason
     assert shape_error(found.locations, expander.locations) < 0.02
-    assert found.costs["LUD"] == pytest.approx(found.costs["ShapeFit"], rel=1e-3)
+    assert found.finish.costs["LUD"] == pytest.approx(found.finish.costs["ShapeFit"], rel=1e-3)
     along = np.sum(differences(found.locations, graph.edges) * graph.directions, axis=1)
     assert along.mean() == pytest.approx(1.0)
     np.testing.assert_allclose(found.locations.mean(axis=0), 0.0, atol=1e-12)
@@ -63,12 +63,12 @@ def test_where_both_starts_agree_nothing_is_said_of_a_collapse_and_the_scale_is_
 def test_of_many_cameras_one_of_two_starts_that_agree_is_refined(chain):
     many = synthetic.box_graph_problem(1000, 20.0, sigma=0.002, q=0.05, seed=1)
     found = finished(many)
-    assert list(found.costs) == ["ShapeFit"]
-    assert found.lud is not None
-    assert "only one is refined" in found.reason
+    assert list(found.finish.costs) == ["ShapeFit"]
+    assert found.finish.lud is not None
+    assert "only one is refined" in found.finish.reason
     assert shape_error(found.locations, many.locations) < 1e-3
-    assert list(finished(many, objective="lud").costs) == ["ShapeFit", "LUD"]
-    assert len(finished(chain).costs) == 2
+    assert list(finished(many, objective="lud").finish.costs) == ["ShapeFit", "LUD"]
+    assert len(finished(chain).finish.costs) == 2
 
 
 def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_chain(chain):
@@ -76,9 +76,9 @@ def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_ch
     options = PlacementOptions(objective="shapefit")
     placement = place(graph, options)
     assert np.array_equal(placement.locations, placement.certified.locations)
-    assert not placement.refined.is_refined
-    assert placement.refined.start == "ShapeFit"
-    assert "as asked" in placement.refined.statement()
+    assert not placement.refined.finish.refined
+    assert placement.refined.finish.start == "ShapeFit"
+    assert "as asked" in placement.refined.finish.statement()
     (warning,) = (w for w in placement.warnings if "two ways to find lengths disagree" in w)
     assert "objective=auto" in warning
     unrefined = " ".join(place(graph, refine=False).warnings)
@@ -90,16 +90,20 @@ def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_ch
 
 def test_lud_is_taken_if_asked_and_without_refinement_the_better_start_as_it_is(chain, expander):
     found = finished(expander, objective="lud")
-    assert (found.start, found.is_refined) == ("LUD", True)
-    median, largest = found.moved
+    assert (found.finish.start, found.finish.refined) == ("LUD", True)
+    median, largest = found.finish.moved_median, found.finish.moved_max
     assert 0.0 < median < largest < 1.0
-    assert f"{median:.2%}" in found.statement()
+    assert f"{median:.2%}" in found.finish.statement()
     raw = finished(expander, objective="lud", refine=False)
-    assert raw.statement() == "LUD, not refined: LUD, as asked"
+    assert raw.finish.statement() == "LUD, not refined: LUD, as asked"
     better = finished(chain, refine=False)
     for unrefined in (raw, better):
-        assert shape_error(unrefined.locations, unrefined.lud.locations) < 1e-12
-        assert (unrefined.start, unrefined.is_refined, unrefined.moved) == ("LUD", False, (0.0, 0.0))
+        assert shape_error(unrefined.locations, unrefined.finish.lud.locations) < 1e-12
+        assert (unrefined.finish.start, unrefined.finish.refined, unrefined.finish.moved_max) == (
+            "LUD",
+            False,
+            0.0,
+        )
 
 
 TRIANGLE = ViewGraph(3, [(0, 1), (1, 2), (2, 0)], normalized(np.eye(3) - np.roll(np.eye(3), -1, axis=0)))
@@ -144,11 +148,11 @@ def test_a_start_whose_cameras_stand_in_one_point_is_not_kept_whatever_it_costs(
 @pytest.mark.parametrize("objective", ["auto", "lud"])
 def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(objective):
     found = finished(synthetic.random_graph_problem(2, 1.0, seed=1), objective=objective)  # two cameras
-    assert found.start == "ShapeFit"
-    assert found.lud is None
-    assert found.disagreement is None
-    assert not found.collapsed
-    assert "no second start" in found.reason
+    assert found.finish.start == "ShapeFit"
+    assert found.finish.lud is None
+    assert found.finish.disagreement is None
+    assert not found.finish.collapsed
+    assert "no second start" in found.finish.reason
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -170,14 +174,14 @@ def test_the_smallest_graphs_are_finished(n, d):
     found = finished(problem)
     assert np.isfinite(found.locations).all()
     assert shape_error(found.locations, problem.locations) < 0.02
-    assert (found.lud is None) == (n == 2)
+    assert (found.finish.lud is None) == (n == 2)
 
 
 def test_too_large_a_factor_is_refused_with_the_reason(expander):
     found = finished(synthetic.box_graph_problem(400, 24.0, seed=1), factor_memory_mb=1)  # MB
-    assert not found.is_refined
-    assert found.statement().endswith("not refined, since the factor for that would be too large")
-    assert "too large" not in finished(expander, refine=False).reason  # nobody asked for it
+    assert not found.finish.refined
+    assert found.finish.statement().endswith("not refined, since the factor for that would be too large")
+    assert "too large" not in finished(expander, refine=False).finish.reason  # nobody asked for it
 
 
 def test_disagreement_is_blind_to_scale_sees_stretched_lengths_and_is_finite_at_one_place():
@@ -203,7 +207,8 @@ def test_a_straight_street_is_placed_by_its_points_and_not_without_them():
         )
     )
     assert shape_error(bare.locations, street.locations[bare.cameras]) > 0.03
-    pair_level, ray_level = joint.refined.levels_deg  # 0.01 and 0.001 rad over sqrt(3), and some excess
+    # 0.01 and 0.001 rad over sqrt(3), and some excess
+    pair_level, ray_level = joint.refined.finish.levels_deg
     assert pair_level == pytest.approx(0.33, rel=0.5)
     assert ray_level == pytest.approx(0.033, rel=0.5)
 
@@ -215,4 +220,4 @@ def test_a_second_start_without_a_bound_stands_where_the_one_with_it_stands(expa
         refine_starts(graph, solved, options, certified=certified) for certified in (True, False)
     )
     assert (start.locations == proved.locations).all()
-    assert start.lud.dual_bound == 0.0 < proved.lud.dual_bound
+    assert start.finish.lud.dual_bound == 0.0 < proved.finish.lud.dual_bound

@@ -402,7 +402,7 @@ def test_a_picture_stands_beside_that_of_another_camera_with_the_matches_of_the_
         )
 
     told, lines = beside(own[1])
-    assert "2 of 23 matches drawn: 3 fit, 20 contradict" in " ".join(told.split())
+    assert "2 of 23 matches drawn: 3 fit, 20 miss" in " ".join(told.split())
     swapped = ends[own[1], 0] != 3  # the chosen camera is on the left; pictures are 100 wide, 2 apart
     fits, contradicts = ("M100.0 75.0L102.0 0.0", "M0.0 75.0L202.0 0.0")
     straight = ("M0.0 0.0L202.0 75.0", "M100.0 0.0L102.0 75.0")

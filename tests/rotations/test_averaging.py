@@ -49,6 +49,16 @@ def covariances(problem):
     return full[np.arange(n), :, np.arange(n)]
 
 
+def test_threads_that_share_the_pairs_change_no_bit():
+    graph = ring_graph_problem(600, 18.0, seed=4).view_graph
+    problem = rotation_problem(graph.num_nodes, graph.edges, noise=0.01)
+    given = problem.relative.pairs, problem.relative.rotations, problem.relative.information
+    assert len(given[0]) > 5_000  # a thread takes as many at once
+    one, three = (average_rotations(*given, threads=threads) for threads in (1, 3))
+    np.testing.assert_array_equal(three.rotations, one.rotations)
+    np.testing.assert_array_equal(three.sigmas_deg, one.sigmas_deg)
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_exact_pairs_give_the_exact_rotations_in_spite_of_wrong_ones(family):
     problem = made(family, noise=0.0)

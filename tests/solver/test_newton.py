@@ -214,6 +214,23 @@ def test_graphs_begun_in_single_precision_are_recovered_to_rounding():
     assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
 
 
+def test_where_single_precision_stalls_double_precision_ends():
+    """Cameras in a row, each with the next three: 480 unknowns, and the row bends at hardly any cost."""
+    rng, n = np.random.default_rng(1), 160
+    t = np.column_stack([np.arange(n), 0.3 * rng.standard_normal((n, 2))])
+    edges = np.array([(i, j) for i in range(n) for j in range(i + 1, min(n, i + 4))])
+    noise = 1e-3 * rng.standard_normal((len(edges), 3))
+    graph = ViewGraph(n, edges, normalized(normalized(t[edges[:, 0]] - t[edges[:, 1]]) + noise))
+    calls = []
+
+    def watch(info):  # without double precision steps would go on for ever, each from where it began
+        calls.append(info.iteration)
+        return len(calls) < 60
+
+    t, y, _ = solve_newton_dense(graph, 1e-10, 100, watch)
+    assert certify(graph, t, y).gap < 1e-10
+
+
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
 def test_a_factor_in_single_precision_leads_to_the_same_answer_as_one_in_double(sigma):
     graph, _ = draw_graph(71, n=151, p=0.15, sigma=sigma, weighted=True)  # 453 unknowns

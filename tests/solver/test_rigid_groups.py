@@ -348,7 +348,7 @@ def test_the_placement_has_the_errors_that_it_states():
         placed = place(MeasuredGraph(graph, groups=groups))
         errors.append(centered(placed.locations / placed.unit) - centered(t))
         stated.append(placed.assessment.sigmas / placed.unit)
-        assert placed.refined.is_refined
+        assert placed.refined.finish.refined
         assert placed.assessment.trust.min() > 0.9
         assert groups.fit(placed.locations)[1] < 1e-9
     rms, said = (float(np.sqrt(np.mean(np.square(x)))) for x in (errors, stated))
@@ -403,7 +403,7 @@ def test_offsets_that_the_directions_contradict_are_an_error_not_a_scale():
 def test_where_four_of_five_pairs_are_wrong_groups_are_placed_at_the_weights_of_a_posterior():
     graph, groups, t = rig_problem(50, frames=16, wrong=0.8, noise=0.002, share=0.6)
     placed = place(MeasuredGraph(graph, groups=groups))
-    assert placed.refined.start == "reweighted ShapeFit"
+    assert placed.refined.finish.start == "reweighted ShapeFit"
     assert placed.refined.reweighted.solved.gap < 1e-7
     assert groups.fit(placed.locations)[1] < 1e-9
     errors = np.linalg.norm(centered(placed.locations / placed.unit) - centered(t), axis=1)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array, rows_taken
+from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array, distinct, rows_taken
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.damage import Damage
 from sfm_shapefit.files.colmap.database_pairs import (
@@ -209,7 +209,7 @@ class DatabaseMatches(Matches):
         of_pair = np.repeat(np.arange(len(chosen)), counts)
         is_same = of_pair[1:] == of_pair[:-1]
         ends = np.cumsum(counts).tolist()
-        for pair in np.unique(of_pair[1:][(both[1:] < both[:-1]) & is_same]).tolist():
+        for pair in distinct(of_pair[1:][(both[1:] < both[:-1]) & is_same]).tolist():
             both[ends[pair] - counts[pair] : ends[pair]].sort()
         new = np.append(True, (both[1:] != both[:-1]) | ~is_same)[: len(both)]
         if not new.all():

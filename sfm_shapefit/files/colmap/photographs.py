@@ -336,7 +336,6 @@ def refuse_lens(options: MatchingOptions) -> None:
 
 
 def _numbers(text: str, count: int) -> list[float]:
-    """Return the parameters of a lens."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:

@@ -10,6 +10,7 @@ from sfm_shapefit.files.colmap.lenses import camera_of, rays_of
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 
 Keypoints = Callable[[int], FloatArray | None]
 """Returns the pixels (k, 2) of the keypoints of an image by its row; k = 0 or None if there are none."""
@@ -55,6 +56,11 @@ def points2d_of(model: ModelArrays, images: Images) -> Keypoints:
     """Return what looks up the points2D of images."""
     rows = model.images.rows(images.ids).tolist()
     return lambda image: np.ascontiguousarray(model.keypoints(rows[image])["xy"], dtype=np.float64)
+
+
+def structure_of(model: ModelArrays, images: Images) -> Structure:
+    """Return the points that some images of a model observe, with their points2D."""
+    return Structure(points_of(model, images), images, ModelKeypoints(images, points2d_of(model, images)))
 
 
 def points_of(model: ModelArrays, images: Images) -> Points:

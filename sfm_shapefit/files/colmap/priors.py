@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, quantile
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import counted, counted_are
 from sfm_shapefit.files.colmap.bitmaps import earth_position, read_bitmap
@@ -173,7 +173,7 @@ def degrees_order(positions: FloatArray, system: PositionSystem) -> tuple[int, i
     if system not in _ORDERS or not len(known):
         return None
     turns = np.column_stack([unwrapped(known[:, 0]), unwrapped(known[:, 1]), np.nan_to_num(known[:, 2])])
-    low, middle, high = np.percentile(turns, [10.0, 50.0, 90.0], axis=0)
+    low, middle, high = (quantile(turns, share) for share in (0.1, 0.5, 0.9))
     spread, far = float(np.max(high[:2] - low[:2])), float(np.max(np.abs(middle[:2])))
     is_steep = not 0.0 < high[2] - low[2] < _STEEP * spread
     if not (0.0 < spread < _WIDEST_DEG and far > _FAR_FROM_ZERO * spread and is_steep):

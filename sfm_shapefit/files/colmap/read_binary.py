@@ -183,7 +183,6 @@ class _BinaryFile:
         return self.fault(f"the file ends inside {what}; it is truncated, copy or write it again")
 
     def read(self, count: int, what: str) -> bytes:
-        """Read so many bytes."""
         try:
             data = self._stream.read(count)
         except OSError as error:
@@ -194,7 +193,6 @@ class _BinaryFile:
         return data
 
     def take(self, layout: struct.Struct, what: str) -> tuple[float, ...]:
-        """Read one record of fixed length."""
         return layout.unpack(self.read(layout.size, what))
 
     def require_room(self, count: int, smallest: int, what: str) -> None:

@@ -18,13 +18,14 @@ from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model_arrays import AT_ONCE, ModelArrays, Records
 from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model, colors_of_pictures
 from sfm_shapefit.files.colmap.point_colors import color_points
-from sfm_shapefit.files.colmap.points import Keypoints
+from sfm_shapefit.files.colmap.points import Keypoints, ModelKeypoints
 from sfm_shapefit.files.colmap.read_binary import read_folder
 from sfm_shapefit.files.colmap.reconstructions import PYCOLMAP_ERRORS, arrays_of, reconstruction_of
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.files.colmap.write_binary import write_binary
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 
 
 class PickedPoints(NamedTuple):
@@ -73,10 +74,10 @@ class SeededModel:
         pixels = tuple(_narrowed(keypoints(k)) for k in range(images.num_images))
         colors, bare = np.zeros((points.num_points, 3), dtype=np.uint8), replace(template, colors=None)
         seed = cls(template=bare, images=images, points=points, colors=colors, keypoints=pixels)
-        return replace(seed, colors=color_points(points, images.ids.tolist(), seed._pixels, template.colors))
+        return replace(seed, colors=color_points(points, images.ids.tolist(), seed.pixels, template.colors))
 
     @cached_property
-    def _pixels(self) -> Callable[[int], FloatArray]:
+    def pixels(self) -> Callable[[int], FloatArray]:
         """What returns the points2D (k, 2) of an image by its row."""
         model, own = self.template.model, self.keypoints
         rows = model.images.rows(self.images.ids).tolist()
@@ -90,6 +91,11 @@ class SeededModel:
 
         return pixels
 
+    @property
+    def structure(self) -> Structure:
+        """The points, and what they are seen with."""
+        return Structure(self.points, self.images, ModelKeypoints(self.images, self.pixels))
+
     def colored(self, pictures: PictureFolder) -> tuple[Self, tuple[str, ...]]:
         """Return the model whose points without a color have that of pictures, and unreadable ones' names."""
         if "reconstruction" in vars(self):  # whoever asked for it may have changed it
@@ -97,7 +103,7 @@ class SeededModel:
             fresh = replace(self)
             vars(fresh)["reconstruction"] = model
             return fresh, unread
-        known = self.points, self.images, self._pixels, self.colors
+        known = self.points, self.images, self.pixels, self.colors
         colors, unread = colors_of_pictures(*known, pictures)
         return replace(self, colors=colors), unread
 

@@ -53,7 +53,6 @@ class _Line:
     text: str
 
     def fault(self, reason: str) -> InputError:
-        """Return the error that names this line."""
         return InputError(f"{self.path}:{self.number}: {reason}")
 
     def numbers(self, words: Sequence[str], what: str) -> list[float]:
@@ -73,7 +72,6 @@ class _Line:
             raise self.fault(f"{what} holds something that is not a whole number") from None
 
     def pack(self, layout: struct.Struct | str, *values: float) -> bytes:
-        """Return values as a record."""
         try:
             return (struct.Struct(layout) if isinstance(layout, str) else layout).pack(*values)
         except struct.error:

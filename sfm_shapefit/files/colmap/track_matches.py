@@ -6,7 +6,7 @@ keypoints gives no match for that point: it is unknown which one is right.
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
+from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array, distinct, stable_order
 from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.model import ColmapModel
@@ -35,7 +35,7 @@ class TrackMatches(Matches):
         seen = [model.arrays.observed(row) for row in rows.tolist()]
         points = np.concatenate([ids for _, ids in seen])
         image_of = np.repeat(np.arange(len(seen)), [len(ids) for _, ids in seen])
-        order = np.argsort(points, kind="stable")
+        order = stable_order(points)
         points, image_of = points[order], image_of[order]
         again = (points[1:] == points[:-1]) & (image_of[1:] == image_of[:-1])
         once = np.ones(len(points), dtype=np.bool_)
@@ -67,7 +67,7 @@ class TrackMatches(Matches):
 
     def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:  # noqa: ARG002
         """Return the matches of pairs; they are made anew each time."""
-        left, right = self._pair_up(np.unique(self.pairs[pairs, 0]))
+        left, right = self._pair_up(distinct(self.pairs[pairs, 0]))
         wanted = self._codes(*self.pairs[pairs].T)
         codes = self._codes(self._image_of[left], self._image_of[right])
         row = np.minimum(np.searchsorted(wanted, codes), len(wanted) - 1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
+from sfm_shapefit.base.arrays import Int32Array, IntArray, distinct, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import compact
 from sfm_shapefit.base.jit import kernel
@@ -84,7 +84,7 @@ def _is_one_piece(num_nodes: int, edges: IntArray, dimension: int) -> bool:
     label = parallel_rigid_pieces(num_nodes, edges, dimension)
     if len(label) == 0:
         return num_nodes == 1
-    return bool(label.max() == 0) and len(np.unique(edges)) == num_nodes
+    return bool(label.max() == 0) and len(distinct(edges)) == num_nodes
 
 
 def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
@@ -97,7 +97,7 @@ def rigid_pieces_of_groups(graph: ViewGraph, groups: RigidGroups) -> list[RigidP
     outer, pieces = np.flatnonzero(groups.joins(graph.edges)), []
     for piece in _find_pieces(groups.num_groups, groups.group_of[graph.edges[outer]], graph.dimension):
         edges = outer[piece.edges]
-        nodes = np.unique(graph.edges[edges])
+        nodes = distinct(graph.edges[edges])
         hinges = nodes[np.isin(groups.group_of[nodes], piece.hinges)]
         pieces.append(RigidPiece(frozen(nodes), frozen(edges), frozen(hinges)))
     return pieces

@@ -163,11 +163,22 @@ const drawTrust = (onChoice) => {
   return svg;
 };
 
-const CELL_CLASSES = ["", "--agrees", "--undetermined", "--nodirection", "--contradicts"];
+// Cells of a single camera each have the color of their pair, the stronger the more matches fit it.
+const STRENGTHS = [0.25, 0.5, 0.75, 1];
 const drawMatrix = (onChoice) => {
-  const { side, perCell, cells, against, counts, rowOf } = data.matrix;
-  const isEmpty = (k) => (perCell === 1 ? cells[k] === 255 : counts[k] === 0);
+  const { side, perCell, against, counts, rowOf } = data.matrix;
   if (!numPairs) return null;
+  const pairIn = new Map();
+  if (perCell === 1) {
+    const places = new Map(Array.from(rowOf, (k, r) => [k, r]));
+    for (let p = 0; p < numPairs; p++) {
+      const [a, b] = [places.get(pairs.first[p]), places.get(pairs.second[p])];
+      pairIn.set(a * side + b, p).set(b * side + a, p);
+    }
+  }
+  const isEmpty = (k) => (perCell === 1 ? !pairIn.has(k) : counts[k] === 0);
+  const [fewest, most] = [quantile(pairs.support, 0), quantile(pairs.support, 1)].map((value) => Math.log1p(value));
+  const strength = (p) => STRENGTHS[Math.floor(3.99 * (most > fewest ? (Math.log1p(pairs.support[p]) - fewest) / (most - fewest) : 1))];
   const [left, top] = [104, 8];
   const size = Math.min((WIDTH - left - 8) / side, 40);
   const bottom = top + side * size;
@@ -175,23 +186,23 @@ const drawMatrix = (onChoice) => {
   const longest = named.reduce((most, name) => Math.max(most, name.length), 0);
   const svg = chart(bottom + 12 + 5.4 * longest, "Which cameras are paired");
   const gap = size > 6 ? 0.8 : 0;
-  const levels = perCell === 1 ? CELL_CLASSES.length : 6;
-  const paths = Array.from({ length: levels }, () => []);
+  const paths = new Map();
   for (let r = 0; r < side; r++) {
     for (let c = 0; c < side; c++) {
       const k = r * side + c;
       if (isEmpty(k)) continue;
-      const level = perCell === 1 ? cells[k] : Math.ceil((5 * against[k]) / counts[k]);
+      const p = pairIn.get(k);
+      const share = Math.ceil((5 * against?.[k]) / counts?.[k]);
+      const look = p === undefined ? `color-mix(in srgb, var(--contradicts) ${20 * share}%, var(--agrees))|1` : `var(${VARIABLES[pairs.verdict[p]]})|${strength(p)}`;
       const d = size - gap;
-      paths[level].push(`M${(left + c * size).toFixed(2)} ${(top + r * size).toFixed(2)}h${d.toFixed(2)}v${d.toFixed(2)}h-${d.toFixed(2)}z`);
+      if (!paths.has(look)) paths.set(look, []);
+      paths.get(look).push(`M${(left + c * size).toFixed(2)} ${(top + r * size).toFixed(2)}h${d.toFixed(2)}v${d.toFixed(2)}h-${d.toFixed(2)}z`);
     }
   }
-  paths.forEach((path, level) => {
-    if (!path.length) return;
-    const paint = perCell === 1 ? `var(${CELL_CLASSES[level]})`
-      : `color-mix(in srgb, var(--contradicts) ${20 * level}%, var(--agrees))`;
-    svg.append(shape("path", { d: path.join(""), fill: paint }));
-  });
+  for (const [look, path] of paths) {
+    const [fill, opacity] = look.split("|");
+    svg.append(shape("path", { d: path.join(""), fill, "fill-opacity": opacity }));
+  }
   svg.append(shape("rect", { x: left, y: top, width: side * size, height: bottom - top, class: "frame" }));
   // Names, as many as are readable.
   const every = Math.max(Math.ceil(12 / size), 1);
@@ -202,17 +213,10 @@ const drawMatrix = (onChoice) => {
     const [x, y] = [left + where + 3.5, bottom + 6];
     svg.append(shape("text", { x, y, transform: `rotate(-90 ${x} ${y})`, "text-anchor": "end", class: "small" }, name));
   }
-  const pairOf = new Map();
-  const key = (a, b) => Math.min(a, b) * numCameras + Math.max(a, b);
-  if (perCell === 1) for (let p = 0; p < numPairs; p++) pairOf.set(key(pairs.first[p], pairs.second[p]), p);
   listen(svg, (u, v) => {
     const [r, c] = [Math.floor((v - top) / size), Math.floor((u - left) / size)];
     if (!(r >= 0 && r < side && c >= 0 && c < side) || isEmpty(r * side + c)) return null;
-    if (perCell === 1) {
-      const [a, b] = [rowOf[r], rowOf[c]];
-      const p = pairOf.get(key(a, b));
-      return p === undefined ? ["text", `${cameras.names[a]} – ${cameras.names[b]}`, [["pair", "see pairs.csv"]]] : ["pair", p];
-    }
+    if (perCell === 1) return ["pair", pairIn.get(r * side + c)];
     const range = (k) => `${cameras.names[rowOf[k * perCell]]} to ${cameras.names[rowOf[Math.min((k + 1) * perCell, numCameras) - 1]]}`;
     const share = ["contradict", `${number((100 * against[r * side + c]) / counts[r * side + c], 2)} %`];
     return ["text", `${range(r)}\nwith ${range(c)}`, [["pairs", count(counts[r * side + c])], share]];
@@ -222,7 +226,7 @@ const drawMatrix = (onChoice) => {
 
 const drawSupport = (onChoice) => {
   const shown = [];
-  for (let p = 0; p < numPairs; p++) if (pairs.verdict[p] !== 3 && pairs.residual[p] > 0 && pairs.support[p] > 0) shown.push(p);
+  for (let p = 0; p < numPairs; p++) if (pairs.residual[p] > 0 && pairs.support[p] > 0) shown.push(p);
   if (!shown.length) return null;
   const told = [0, 1, 2].filter((v) => shown.some((p) => pairs.verdict[p] === v));
   const key = layOutKey(told.map((v) => [VERDICTS[v], `var(${VARIABLES[v]})`]));
@@ -282,8 +286,45 @@ const widthOfColumn = () => {
   const columns = Number(columnCount) || 1;
   return Math.max(Math.min(($("more").clientWidth - BETWEEN * (columns - 1)) / columns - 34, 760), 280);
 };
+
+// Mean residuals over the picture of a lens, as arrows whose scale is written below.
+const drawField = ({ aspect, places, means }) => {
+  const [left, top] = [8, 8];
+  const width = Math.min(WIDTH - 2 * left, 400, 300 * aspect);
+  const height = width / aspect;
+  const [all, down] = [width + 2 * left, height + top + 30];
+  const svg = shape("svg", { viewBox: `0 0 ${all} ${down}`, role: "img", "aria-label": "Mean residuals over the picture" });
+  svg.style.maxWidth = `${all}px`;
+  const total = means.length / 2;
+  const lengths = Array.from({ length: total }, (_, k) => Math.hypot(means[2 * k], means[2 * k + 1]));
+  const longest = quantile(lengths, 0.95) || 1;
+  const scale = (1.2 * Math.sqrt((width * height) / total)) / longest;
+  let path = "";
+  lengths.forEach((length, k) => {
+    const [x, y] = [left + width * places[2 * k], top + height * places[2 * k + 1]];
+    const [u, v] = [scale * means[2 * k], scale * means[2 * k + 1]];
+    const [p, q] = [0.3 * u, 0.3 * v]; // the head turns back at either side
+    path += `M${x.toFixed(1)} ${y.toFixed(1)}l${u.toFixed(1)} ${v.toFixed(1)}m${(-p - q / 2).toFixed(1)} ${(-q + p / 2).toFixed(1)}L${(x + u).toFixed(1)} ${(y + v).toFixed(1)}l${(-p + q / 2).toFixed(1)} ${(-q - p / 2).toFixed(1)}`;
+  });
+  svg.append(shape("rect", { x: left, y: top, width, height, class: "frame" }), shape("path", { d: path, class: "arrows" }));
+  const said = 10 ** Math.floor(Math.log10(longest));
+  const length = said * [1, 2, 5].filter((part) => part * said <= longest).pop();
+  const y = top + height + 18;
+  svg.append(shape("line", { x1: left, x2: left + scale * length, y1: y, y2: y, class: "scale" }));
+  svg.append(shape("text", { x: left + scale * length + 8, y: y + 4 }, `${number(length)} px`));
+  return svg;
+};
+const drawFields = () => {
+  $("fields-card").hidden = !data.fields.length;
+  fill("fields", ...data.fields.map((field) => {
+    const made = element("div", "", "field");
+    made.append(element("h4", field.label), drawField(field), element("p", field.statement));
+    return made;
+  }));
+};
 const drawCharts = (onChoice) => {
   WIDTH = widthOfColumn();
+  drawFields();
   const made = {
     trust: drawTrust, histogram: drawHistogram,
     tracks: () => drawBars("tracks", "Track lengths", "images that see a point"),

@@ -1,8 +1,8 @@
 // What all parts of the page share: its data, and small helpers. Names come from strangers: they reach the
 // page through textContent only.
 const TYPES = { f4: Float32Array, i4: Int32Array, u2: Uint16Array, u1: Uint8Array };
-const VERDICTS = ["agrees", "contradicts", "cannot be judged", "no direction"];
-const LAYER_OF = ["agrees", "contradicts", "undetermined", "nodirection"];
+const VERDICTS = ["agrees", "contradicts", "cannot be judged", "no direction", "rejected"];
+const LAYER_OF = ["agrees", "contradicts", "undetermined", "nodirection", "rejected"];
 const VARIABLES = LAYER_OF.map((name) => `--${name}`);
 const $ = (id) => document.getElementById(id);
 
@@ -21,6 +21,7 @@ const data = decode(JSON.parse($("data").textContent));
 const { cameras, pairs, points } = data;
 const numCameras = cameras.names.length;
 const numPairs = pairs.first.length;
+const isGood = data.banner.grade === "good";
 // Of pairs: how many matches fit and contradict, how many of either are drawn, and the row of the first of these.
 const matches = new Map();
 if (data.matches) {
@@ -60,7 +61,7 @@ const number = (value, digits = 3) => {
   if (value === 0) return "0";
   const size = Math.abs(value);
   if (size < 1e-3 || size >= 1e6) return value.toExponential(Math.max(digits - 1, 0));
-  return Number(value.toPrecision(digits)).toString();
+  return size >= 10 ** digits ? count(Math.round(value)) : Number(value.toPrecision(digits)).toString();
 };
 const count = (value) => value.toLocaleString("en", { maximumFractionDigits: 9 });
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
@@ -94,7 +95,7 @@ const middleOfName = (whole, most) => {
   return `${name.slice(0, most - tail - 1)}…${name.slice(-tail)}`;
 };
 const pairTitle = (p) => `${cameras.names[pairs.first[p]]} – ${cameras.names[pairs.second[p]]}`;
-const off = (value) => number(value, 2) && `${number(value, 2)}°`;
+const off = (value) => number(value) && `${number(value)}°`;
 
 const isDark = () => {
   const chosen = document.documentElement.dataset.theme;
@@ -126,7 +127,7 @@ const cameraFacts = (k) => [
   ["pairs", cameras.degree[k] ? agreeing(k) : "none"],
   ["typical error", off(cameras.error[k])],
   ["moved from the input", cameras.shift && number(cameras.shift[k], 2) ? `${number(cameras.shift[k], 2)} units` : ""],
-  ...cameras.further.map(({ hint, values }) => [hint[0].toLowerCase() + hint.slice(1), number(values[k])]),
+  ...cameras.further.map(({ title, values }) => [title.toLowerCase(), number(values[k])]),
   ["why", reason(cameras.reason[k])],
   ["stands apart", cameras.group[k] < 0 ? "" : `with group ${cameras.group[k] + 1} (colors show it)`],
   ["another place", Number.isFinite(cameras.other[3 * k]) ? otherPlace(k) : ""],

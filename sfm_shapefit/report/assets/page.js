@@ -6,7 +6,7 @@ const drawHead = () => {
   $("subtitle").textContent = [data.subtitle, data.day].filter(Boolean).join(", ");
   $("banner").dataset.grade = banner.grade;
   $("h-cameras").textContent = `${capital(data.noun)}s`;
-  $("h-matrix").textContent = `Which ${data.noun}s are paired`;
+  $("h-matrix").textContent = `Overlap: which ${data.noun}s are paired`;
   $("mark").textContent = { good: "✓", look: "!", "cannot be judged": "?", "do not use": "✕" }[banner.grade] ?? "";
   $("verdict").textContent = banner.headline;
   $("why").textContent = banner.sentence;
@@ -51,7 +51,6 @@ const drawFacts = () => {
   }));
   fill("summary", ...data.summary.map((text) => element("li", text)));
   fill("expert-facts", ...data.expertFacts.map((text) => element("li", text)));
-  const isGood = data.banner.grade === "good";
   if (isGood) $("looks-title").textContent = "Of note";
   const looks = data.looks.map(({ text, camera, pair }) => {
     const item = element("li", "", isGood ? "fine" : "");
@@ -93,7 +92,7 @@ const drawPieces = () => {
 };
 const drawControl = () => {
   $("lenses-card").hidden = !data.lenses.length;
-  fill("lenses", plainTable(["Camera", "Model", "Images", "Picture (px)", "Focal length (px)", "Principal point (px)", "Distortion"], data.lenses));
+  fill("lenses", plainTable(["Camera id", "Model", "Images", "Picture (px)", "Focal length (px)", "Principal point (px)", "Distortion"], data.lenses));
   $("intrinsics-card").hidden = !data.intrinsics.length;
   fill("intrinsics", plainTable(["Camera", "Model", "Images", "Focal length given (px)", "Found (px)", "Change", "Distortion"], data.intrinsics));
   $("control-card").hidden = !data.control.length;
@@ -116,11 +115,11 @@ const definitions = (facts) => {
   for (const [label, value] of known(facts)) list.append(element("dt", label), element("dd", value));
   return list;
 };
-const dotOf = (verdict) => {
+const dotOf = (verdict, words = VERDICTS) => {
   const dotted = element("span", "", "dot");
   if (verdict === null) return dotted;
   dotted.style.background = `var(${VARIABLES[verdict]})`;
-  dotted.title = VERDICTS[verdict];
+  dotted.title = words[verdict];
   return dotted;
 };
 const listItem = (verdict, text, note, action) => {
@@ -166,7 +165,7 @@ const matchesSaid = (p) => {
   const { counts, drawn } = matches.get(p);
   const all = counts[0] + counts[1];
   const few = drawn[0] + drawn[1] < all ? `${drawn[0] + drawn[1]} of ${counted(all, "match").replace("chs", "ches")} drawn: ` : "";
-  return [few, dotOf(0), ` ${count(counts[0])} fit, `, dotOf(1), ` ${count(counts[1])} contradict`];
+  return [few, dotOf(0, ["fits"]), ` ${count(counts[0])} fit, `, dotOf(1, ["", "misses"]), ` ${count(counts[1])} miss`];
 };
 const sideBySide = (k, p) => {
   const shown = picturesOf([k, otherEnd(p, k)]);
@@ -231,7 +230,7 @@ const pairDetails = (p) => {
   const others = element("ul");
   for (const end of ends) others.append(listItem(null, cameras.names[end], "", () => select("camera", end)));
   const figure = sideBySide(ends[0], p);
-  return ["Pair", pairFacts(p), pairExpertFacts(p), others, [figure, () => {}]];
+  return [`Pair ${pairTitle(p)}`, pairFacts(p), pairExpertFacts(p), others, [figure, () => {}]];
 };
 const drawDetails = () => {
   $("details").classList.toggle("empty", !selected);
@@ -290,6 +289,7 @@ drawLoops();
 tables = drawTables(select);
 drawDetails();
 $("pairs-note").textContent = data.pairsNote;
+$("pairs-words").textContent = data.pairsWords;
 $("scene-note").textContent = data.sceneNote;
 scene = makeScene((kind, k) => select(kind, k, true));
 $("scene").scene = scene;

@@ -140,7 +140,7 @@ const drawTables = (onChoice) => {
       named(capital(data.noun), (k) => cameras.names[k]),
       ...(isKnown(cameras.trust) ? [numeric("Trust", (k) => cameras.trust[k], 2, "1: its matches fit as well as usual; below 0.6 it is left out unless you say otherwise")] : []),
       ...(isKnown(cameras.sigma) ? [aligned("± units", cameras.sigma.map((value, k) => (isPlaced(k) ? value : NaN)), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units")] : []),
-      numeric("Pair error (°)", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees"),
+      numeric("Pair error (°)", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees: large where most of them contradict"),
       {
         title: "Pairs agree", number: true, value: (k) => (cameras.degree[k] ? cameras.agreeing[k] / cameras.degree[k] : NaN),
         cell: (k) => element("td", cameras.degree[k] ? `${cameras.agreeing[k]}/${cameras.degree[k]}` : "none", "number"),
@@ -153,7 +153,7 @@ const drawTables = (onChoice) => {
       named(`${capital(data.noun)} 2`, (p) => cameras.names[pairs.second[p]]),
       { title: "Verdict", value: (p) => VERDICTS[pairs.verdict[p]], cell: verdictCell },
       numeric("Off by (°)", (p) => pairs.residual[p], 3, "Angle between the direction that its matches say and the placed cameras"),
-      ...(data.hasSupport ? [numeric("Matches", (p) => pairs.support[p], 9)] : []),
+      ...(data.hasSupport ? [numeric("Matches", (p) => pairs.support[p], 3, "Matches that fit the pair")] : []),
     ], pairTitle, (p) => reason(pairs.reason[p]), onChoice),
   };
 };

@@ -2,7 +2,9 @@
 
 const MANY_PAIRS = 200; // with more, agreeing pairs are not drawn until asked for
 const MANY_WITHOUT_POINTS = 1000; // where they hide nothing
-const MANY_WRONG = 20; // contradicting pairs, long lines across the scene
+const MANY_WRONG = 100; // contradicting pairs, long lines across the scene
+const MANY_SET_ASIDE = 20; // the same where the verdict is good
+const MANY_REJECTED = 20;
 const MOST_PAIRS = 4000;
 const FAR_DEG = 1; // pairs that contradict by less are not drawn either
 const PICK_CAMERA_PX = 11;
@@ -188,11 +190,11 @@ const makeScene = (onChoice) => {
       if (isDrawn(p)) drawn.push(p);
     }
     if (!drawn.length) return;
-    const said = `Pairs ${["that agree", "that contradict", "that cannot be judged", "without a direction"][verdict]}`;
+    const said = `Pairs ${["that agree", "that contradict", "that cannot be judged", "without a direction", "rejected"][verdict]}`;
     const amount = drawn.length === total ? count(total) : `${count(drawn.length)} of ${count(total)}`;
     const limit = verdict === 0 ? (points.positions.length ? MANY_PAIRS : MANY_WITHOUT_POINTS)
-      : verdict === 1 ? MANY_WRONG : MOST_PAIRS;
-    const shown = drawn.length <= limit && verdict !== 3 && (verdict !== 1 || drawn.some((p) => pairs.residual[p] >= FAR_DEG));
+      : verdict === 1 ? (isGood ? MANY_SET_ASIDE : MANY_WRONG) : verdict === 4 ? MANY_REJECTED : MOST_PAIRS;
+    const shown = drawn.length <= limit && verdict !== 3 && (verdict !== 4 || !isGood) && (verdict !== 1 || drawn.some((p) => pairs.residual[p] >= FAR_DEG));
     const order = spread(drawn.length).map((k) => drawn[k]);
     addLayer(name, `${said} (${amount})`, shown, {
       variable: VARIABLES[verdict], pairs: order, segments: painter.shapes(SEGMENT, pairColumns(order)),
@@ -256,7 +258,7 @@ const makeScene = (onChoice) => {
     const ratio = pixelRatio();
     if (one.cloud) {
       const size = 0.003 * radius * sizes.point * eye.pixelsPerUnit() * view.distance * ratio;
-      const limits = { least: 1.8 * ratio * Math.min(sizes.point, 2), most: 4 * ratio * sizes.point };
+      const limits = { least: 1.8 * ratio * Math.min(sizes.point, 2), most: 2.5 * ratio * sizes.point };
       painter.paint(one.cloud, { ...common, size, ...limits }, SHARES[detail()]);
     }
     if (one.lines && (!detail() || placed.length < 300)) painter.paint(one.lines, { ...common, scale: sizes.frustum, width: 1.6 * ratio });
@@ -268,7 +270,7 @@ const makeScene = (onChoice) => {
       painter.paint(one.segments, { ...common, scale: 1, width: (one.isGrid ? 1 : 1.5) * ratio, tint: [...tint, one.alpha] }, one.pairs ? SHARES[detail()] : 1);
     }
   };
-  const ORDER = ["grid", "points", "cameras", "ghosts", "elsewhere", "ellipsoids", "input", "agrees", "nodirection", "undetermined", "contradicts"];
+  const ORDER = ["grid", "points", "cameras", "ghosts", "elsewhere", "ellipsoids", "input", "agrees", "nodirection", "rejected", "undetermined", "contradicts"];
   const draw = () => {
     const ratio = pixelRatio();
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.round(side * ratio));
@@ -469,7 +471,7 @@ const makeScene = (onChoice) => {
     highlight = {
       frusta: posed.length ? painter.shapes(FRUSTUM, frustumColumns(posed)) : null,
       dots: ends.length ? painter.cloud({ center: new Float32Array(ends.flatMap(positionOf)) }) : null,
-      pairs: [0, 2, 1].map((verdict) => {
+      pairs: (choice[0] === "pair" ? [0, 1, 2, 3, 4] : [0, 2, 1]).map((verdict) => {
         const rows = own.filter((p) => pairs.verdict[p] === verdict && isDrawn(p));
         return [verdict, rows.length ? painter.shapes(SEGMENT, pairColumns(rows)) : null, rows];
       }).filter(([, made]) => made),

@@ -1,0 +1,113 @@
+"""Residuals per lens: a pattern is told by a test of chance, and whose it is by its direction."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from sfm_shapefit import check
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.points import structure_of
+from sfm_shapefit.report.lens_residuals import lens_fields
+from tests.lens_scene import camera_of_model, write_scene
+from tests.report.test_report_page import data_of, unpacked
+
+NOISE_PX = 0.3
+NONE = "No pattern: residuals point everywhere. The lens model fits."
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Twelve images of 120 points through a lens that bends outward by 3 px at their rim."""
+    camera = camera_of_model("SIMPLE_RADIAL")
+    camera.params = [500.0, 320.0, 240.0, 0.15]
+    folder = tmp_path_factory.mktemp("scene")
+    write_scene(folder, [camera], num_frames=12)
+    return folder / "sparse/0"
+
+
+def fields_with(scene, pattern, seed=0):
+    """Return the fields of the scene where keypoints are off by noise and a pattern (k, 2) of their places.
+
+    Places are in half heights of the picture, from its middle.
+    """
+    model, rng = pycolmap.Reconstruction(scene), np.random.default_rng(seed)
+    for image in model.images.values():
+        for point in image.points2D:
+            if point.has_point3D():
+                exact = image.project_point(model.points3D[point.point3D_id].xyz)
+                place = (exact - [320.0, 240.0]) / 240.0
+                point.xy = exact + pattern(place) + rng.normal(0.0, NOISE_PX, 2)
+    read = read_model(model)
+    return lens_fields(structure_of(read.arrays, read.images))
+
+
+def none(place):
+    return np.zeros(2)
+
+
+def inward(place):
+    return -2.0 * np.hypot(*place) ** 2 * place
+
+
+def twisted(place):
+    return np.array([-place[1], place[0]])
+
+
+def slight(place):
+    return 0.1 * place
+
+
+@pytest.mark.parametrize(
+    ("pattern", "said"),
+    [
+        (none, NONE),
+        (inward, "They point inward at the rim, by "),
+        (twisted, "not along the radius"),
+        (slight, "too small to matter"),
+    ],
+)
+def test_what_residuals_have_in_common_over_the_picture_is_said_of_the_lens(scene, pattern, said):
+    (field,) = fields_with(scene, pattern)
+    assert said in field.statement
+    if pattern is slight:  # as large as the pattern is where the points are, whose RMS distance is 0.6
+        size = float(field.statement.split("A pattern of ")[1].split()[0])
+        assert size == pytest.approx(0.06, rel=0.2)
+    assert field.label == "Camera 1, SIMPLE_RADIAL"
+    # Cells hold 15 residuals or more; means are off by the noise of so many, of which the largest is 4 sigma,
+    # and by what the pattern varies over a cell, a tenth of the picture wide.
+    places = (field.places * [640.0, 480.0] - [320.0, 240.0]) / 240.0
+    wanted = np.array([pattern(place) for place in places])
+    assert np.abs(field.means_px - wanted).max() < 4.0 * NOISE_PX / np.sqrt(15) + 0.3 * np.abs(wanted).max()
+
+
+def test_noise_is_no_pattern_whatever_its_seed(scene):
+    # One of 200 would be, by the level of the test: two or more of 12 in a thousandth of the draws.
+    said = [field.statement for seed in range(1, 13) for field in fields_with(scene, none, seed)]
+    assert sum(one != NONE for one in said) <= 1
+
+
+def test_a_lens_without_its_distortion_points_outward_at_the_rim_and_the_page_draws_it(scene, tmp_path):
+    model, said = pycolmap.Reconstruction(scene), {}
+    for bend in (0.15, 0.0):
+        model.cameras[1].params = [500.0, 320.0, 240.0, bend]
+        page = tmp_path / f"{bend}.html"
+        check(model, second_opinion=False).report(page)
+        (field,) = data_of(page.read_text(encoding="utf-8"))["fields"]
+        said[bend] = field["statement"]
+        assert len(unpacked(field["places"])) == len(unpacked(field["means"])) > 20
+    assert said[0.15] == NONE
+    assert "They point outward at the rim" in said[0.0]
+
+
+def test_few_images_are_no_evidence_and_few_residuals_are_not_drawn(scene):
+    model = pycolmap.Reconstruction(scene)
+    frames = [image.frame_id for image in model.images.values()]
+    for frame in frames[6:]:
+        model.deregister_frame(frame)
+    read = read_model(model)
+    (field,) = lens_fields(structure_of(read.arrays, read.images))
+    assert field.statement == "6 images are too few to tell a pattern from chance."
+    for frame in frames[2:6]:
+        model.deregister_frame(frame)
+    read = read_model(model)
+    assert lens_fields(structure_of(read.arrays, read.images)) == ()
