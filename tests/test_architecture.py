@@ -14,6 +14,8 @@ MOST_ARROWS = 91  # between rooms, beside those to base/; the list may only beco
 # Lines of the package, docstrings and blank ones counted; who raises it says in the commit what they buy.
 MOST_LINES = 64_600
 MOST_LINES_OF_A_PAGE = 150  # of the pipeline of a command, so that its stages are seen at one glance
+MOST_STAGES, MOST_FLOORS_OF_STAGES = 24, 7  # of pipeline/; what users call is a page of commands/
+MOST_IMPORTED = 46  # names of a page or stage; one that does several things is to be split by these
 SLACK_LINES = 300  # a budget further above the package than this is to be lowered
 
 DOORS = {
@@ -61,10 +63,38 @@ def test_the_package_keeps_within_its_budget_of_lines():
     assert MOST_LINES - SLACK_LINES <= lines <= MOST_LINES
 
 
-@pytest.mark.parametrize("command", ["check", "join", "locate", "map", "place"])
+@pytest.mark.parametrize(
+    "command", ["check", "inspect", "join", "lengths", "locate", "map", "match", "place"]
+)
 def test_the_pipeline_of_a_command_is_a_page(command):
     text = (PACKAGE / f"commands/{command}.py").read_text(encoding="utf-8")
     assert len(text.splitlines()) <= MOST_LINES_OF_A_PAGE
+
+
+def test_the_stages_are_few_and_stand_on_few_floors():
+    stages = {path.stem: path for path in MODULES if room_of(path) == "pipeline" and path.stem != "__init__"}
+    floors: dict[str, int] = {}
+    while len(floors) < len(stages):  # from below: whose own imports have a floor already
+        for name, path in stages.items():
+            used = {one for one in stages if f"sfm_shapefit.pipeline.{one}" in imports_of(path)} - {name}
+            if name not in floors and used <= set(floors):
+                floors[name] = 1 + max((floors[one] for one in used), default=0)
+    assert len(stages) <= MOST_STAGES
+    assert max(floors.values()) <= MOST_FLOORS_OF_STAGES
+
+
+@pytest.mark.parametrize("room", ["commands", "pipeline"])
+def test_no_stage_or_page_imports_very_many_names(room):
+    names = {
+        path.stem: sum(
+            len(node.names)
+            for node in ast.walk(tree_of(path))
+            if isinstance(node, ast.Import | ast.ImportFrom)
+        )
+        for path in MODULES
+        if room_of(path) == room
+    }
+    assert {stem: count for stem, count in names.items() if count > MOST_IMPORTED} == {}
 
 
 def test_only_kernels_and_commands_have_many_parameters():

@@ -17,7 +17,7 @@ of an adjustment, are made for each step twice, and never kept.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -120,10 +120,11 @@ class Parts:
         """Divide the points and lay out each part."""
         self._crew, nodes = crew, number_nodes(problem, options)
         self._problem, self._noise_px = problem, options.noise_px
-        shares, problems, numbers = zip(*_divide(problem, nodes), strict=True)
-        self._shares: tuple[_Share, ...] = shares
-        every = [replace(options, threads=crew.threads_of_task)] * len(shares)
-        self._parts = crew.keep(lay_out, problems, every, numbers)
+        self._shares, self._parts = list[_Share](), list[Any]()
+        how = replace(options, threads=crew.threads_of_task)
+        for share, part, numbers in _divide(problem, nodes):  # one at a time, for memory
+            self._shares.append(share)
+            self._parts += crew.keep(lay_out, [part], [how], [numbers])
         self.layout, self._rows = self._join(problem, options, nodes)
 
     def _join(

@@ -46,7 +46,7 @@ _BLOCK, _OVERLAP = 150, 0.15
 _GROUP = 12  # frames of a group; with thrice as many, iterations are a third more
 _GROUPS_OF_A_NODE = 4  # groups whose similarities a frame weighs at most; the others weigh next to nothing
 _OWN_SHARE = 0.2  # weight of a frame's own group, over that of its neighbors; they make it smooth
-_PAIRS_AT_ONCE = 100_000  # pairs of nodes whose groups are listed; they take 50 MB
+_PAIRS_AT_ONCE = 100_000  # pairs of nodes that are looked at together; they take 50 MB
 _SIMILARITY = 7  # unknowns of a group; three shifts, three turns, one scaling
 # Shares of the diagonal that are added to it, in turn until there is a factor: of 32 bits for a block, as its
 # rounding only costs iterations, and of 64 for the coarse system, where the least motions are.
@@ -276,8 +276,13 @@ def _strengths(system: ReducedSystem, pairs: IntArray) -> FloatArray:
     """Return how strongly pairs are tied, (P,): the norm of their block, unknowns scaled to curvature 1."""
     curvatures = np.einsum("naa->na", system.diagonal)
     scales = np.sqrt(np.where(curvatures > 0.0, curvatures, np.inf))  # what is rounding ties nothing
-    scaled = system.pairs / (scales[pairs[:, 0], :, None] * scales[pairs[:, 1], None, :])
-    return np.asarray(np.sqrt(np.einsum("kab,kab->k", scaled, scaled)))
+    squares = np.empty(len(pairs))
+    for first in range(0, len(pairs), _PAIRS_AT_ONCE):
+        own = slice(first, first + _PAIRS_AT_ONCE)
+        i, j = pairs[own].T
+        scaled = system.pairs[own] / (scales[i, :, None] * scales[j, None, :])
+        squares[own] = np.einsum("kab,kab->k", scaled, scaled)
+    return np.sqrt(squares)
 
 
 def _group_frames(num_frames: int, ties: IntArray, strengths: FloatArray) -> tuple[IntArray, FloatArray]:

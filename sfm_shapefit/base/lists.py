@@ -49,7 +49,8 @@ class Lists:
         """Return the rows of some lists, in that order."""
         lengths = self.lengths()[chosen]
         offsets = offsets_of(lengths)
-        rows = np.repeat(self.offsets[chosen] - offsets[:-1], lengths) + np.arange(offsets[-1])
+        rows = np.repeat(self.offsets[chosen] - offsets[:-1], lengths)
+        rows += np.arange(offsets[-1])  # in place, for many rows
         return RowLists(offsets, rows)
 
 

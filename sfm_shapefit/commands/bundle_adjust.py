@@ -1,6 +1,5 @@
 """`bundle_adjust`: poses and points of a model adjusted by its own observations; for pipelines."""
 
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,12 +17,11 @@ from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.facts.lengths import WITHIN_95, within_95
 from sfm_shapefit.files.colmap.model import ModelSource, read_model
 from sfm_shapefit.files.colmap.reconstructions import moved_reconstruction
 from sfm_shapefit.pipeline.bundle import read_bundle
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
-
-_WITHIN_95 = 1.96  # standard deviations; between them on either side lie 95 % of a normal distribution
 
 if TYPE_CHECKING:
     import pycolmap
@@ -39,11 +37,10 @@ class Length(NamedTuple):
     @property
     def half_width(self) -> float:
         """Half the interval that holds the distance with a probability of 95 %."""
-        return _WITHIN_95 * self.sigma
+        return WITHIN_95 * self.sigma
 
     def __str__(self) -> str:
-        digits = max(1 - math.floor(math.log10(self.half_width)), 0) if self.half_width > 0.0 else 6
-        return f"{self.value:.{digits}f} ± {self.half_width:.{digits}f} (95 %)"
+        return within_95(self.value, self.half_width)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

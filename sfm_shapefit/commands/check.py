@@ -10,7 +10,7 @@ from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.commands.map import map_database, map_opened
 from sfm_shapefit.commands.pictures import match_pictures
-from sfm_shapefit.facts.check_result import CheckResult
+from sfm_shapefit.facts.check_result import CheckResult, OtherModel
 from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import MapResult
@@ -22,7 +22,7 @@ from sfm_shapefit.files.model_folder import model_folders
 from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
-from sfm_shapefit.pipeline.referee import OtherModel, check_source
+from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
 

@@ -13,13 +13,14 @@ from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import flat_values, merge_options
 from sfm_shapefit.facts.command_options import JoinOptions
+from sfm_shapefit.facts.joined_cameras import JoinInputs
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.bundle import adjust_joined
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
-from sfm_shapefit.pipeline.model_joins import JoinInputs, judge_joins, merge_groups, tell_group
+from sfm_shapefit.pipeline.model_joins import judge_joins, merge_groups, tell_group
 from sfm_shapefit.pipeline.pieces import ModelPiece, missing_images, read_pieces, tie_pieces
 
 if TYPE_CHECKING:

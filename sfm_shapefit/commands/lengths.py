@@ -6,11 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.place_errors import (
-    ScaleErrors,
-    draws_at,
-    errors_of_images,
-)
+from sfm_shapefit.adjustment.place_errors import ScaleErrors, draws_at, errors_of_images
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.lengths import (
     Axes,

@@ -68,11 +68,7 @@ def match_images(
     found = find_photographs(folder)
     refuse_rigs(options, found)
     made = PhotographDatabase(
-        folder=folder,
-        database=path,
-        names=found,
-        options=options,
-        threads=clock.threads,
+        folder=folder, database=path, names=found, options=options, threads=clock.threads
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     _remember(path, options)

@@ -51,9 +51,7 @@ def match_pictures(
         pictures = PictureMatches(model=model, database=path, threads=clock.threads)
         with clock("features"):
             states = pictures.detect(
-                folder,
-                lambda: time.monotonic() > began + 60.0 * _FOR_FEATURES * minutes,
-                clock.advance,
+                folder, lambda: time.monotonic() > began + 60.0 * _FOR_FEATURES * minutes, clock.advance
             )
         _refuse_no_pictures(folder, model.images.names, states)
         tracks = TrackMatches(model)

@@ -93,7 +93,8 @@ class WarmUp:
 def warm_up(examples: Sequence[str], report: Tell | None = None) -> WarmUp:
     """Compile the kernels that examples need and keep them on disk, in as many processes as there are cores.
 
-    Examples are names of functions of `commands.examples`; `report` is called whenever a kernel is ready.
+    Examples are names of functions of `commands.examples` or `part_examples`; `report` is called whenever a
+    kernel is ready.
     """
     if not examples:
         return WarmUp(0, ())
@@ -205,11 +206,12 @@ def _work(connection: Any, scratch: str, objects_between_searches: tuple[int, in
         connection.send(None)
         while name := connection.recv():
             try:
-                from sfm_shapefit.commands import examples
+                from sfm_shapefit.commands import examples, part_examples
 
                 folder = Path(scratch, name)
                 folder.mkdir()
-                getattr(examples, name)(folder)
+                example = getattr(examples, name, None) or getattr(part_examples, name)
+                example(folder)
                 note(name, PACKAGE / "commands")
             except Exception as error:  # whatever it is, the others are worth running
                 connection.send(WarmUpError(f"{name}: {type(error).__name__}: {error}"))

@@ -1,10 +1,11 @@
 """The verdict on a model as it stands, with its tables of cameras and pairs."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.display import Reported
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.model import CheckedFacts
@@ -90,3 +91,18 @@ def checked_camera_rows(model: ColmapModel, fits: PairFits | None, weak: list[Re
     reasons = ["it has no pose in the model"] * len(others)
     unposed = Table(CameraRow, 3, {"name": others, "reason": reasons})
     return Table(CameraRow, 3, columns).followed_by(unposed)
+
+
+class OtherModel(NamedTuple):
+    """Another model of the same matches, to compare with."""
+
+    images: Images
+    """Where it has the images."""
+    fits: PairFits
+    """How pairs fit it."""
+    doubted: BoolArray
+    """(n,) images that may stand elsewhere by their own matches."""
+    source: MapResult
+    """What it is one of."""
+    number: int
+    """Which of these it is."""

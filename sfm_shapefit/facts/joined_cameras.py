@@ -7,20 +7,35 @@ Errors of a join come on top of those of its models, as if they moved each camer
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import Similarity
+from sfm_shapefit.facts.check_result import CheckResult
 from sfm_shapefit.facts.joins import JoinFacts
-from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.facts.map_result import JoinedModel
+from sfm_shapefit.facts.model import JoinedFacts
+from sfm_shapefit.facts.placed import UNITS, KeyFigures
+from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.rows import correlations_of, covariances_of
+from sfm_shapefit.facts.scale_bars import compare_bars
+from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.facts.tables import CameraRow, Table
 from sfm_shapefit.judgement.reasons import Grade, ModelVerdict
+from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.gauge_options import KnownDistance
+from sfm_shapefit.scene.given import ScaleBars
 
 if TYPE_CHECKING:
     import pycolmap
+
+_SIGMA_OF = (
+    "joined: what the models know of their cameras, and how well the joins are known; relative to the mean "
+    "position and scale of the first"
+)
 
 
 class JoinedGroup(NamedTuple):
@@ -96,3 +111,63 @@ def joined_verdict(
         if one.grade is not Grade.CANNOT_BE_JUDGED
     ]
     return ModelVerdict.weigh([*said, *seen.findings])
+
+
+class JoinInputs(NamedTuple):
+    """What is known of joined models beside the models."""
+
+    joins: Sequence[JoinFacts]
+    """What came of joining each model to another."""
+    options: Mapping[str, Any]
+    inputs: Inputs
+    """Where matches come from."""
+    distances: Sequence[KnownDistance] = ()
+    bars: ScaleBars | None = None
+    """Scale bars with their marks in the images of the group."""
+    located: Mapping[int, LocateResult] = MappingProxyType({})
+    """The models by number, as far as they are ours, with what is known of their cameras."""
+    notes: Sequence[str] = ()
+    """What was read otherwise than it stands in the models."""
+
+
+def tell_joined(group: JoinedGroup, told: JoinInputs, checked: CheckResult, gauge: Gauge) -> JoinedModel:
+    """Return joined models in a gauge with what is told of them, beside what `check` said of them."""
+    first, located, images = next(iter(group.world_from)), told.located, checked.model.images
+    labels = {
+        k: name for one in group.joins for k, name in ((one.number, one.model), (one.to_number, one.to))
+    }
+    folder = f"joined_{first}" if located else "."
+    seen, measures = checked.facts, (float(np.median(images.focal_lengths_px)), UNITS[gauge.scale])
+    cameras = joined_camera_rows(checked.cameras, group, located)
+    bars = told.bars and compare_bars(images, told.bars, None, gauge.scale_sigma)
+    facts = JoinedFacts.taken_from(
+        seen,
+        inputs=told.inputs.facts,
+        options=dict(told.options),
+        verdict=joined_verdict(seen.verdict, group, located),
+        models=[labels[number] for number in group.world_from],
+        joins=[
+            replace(one, folder=folder if one.joined and one.number in labels else None) for one in told.joins
+        ],
+        num_images=len(cameras),
+        num_placed=group.reconstruction.num_reg_images(),
+        figures=KeyFigures.of_cameras(cameras, seen.figures.pair_error_deg, *measures),
+        sigma_of=_SIGMA_OF if located else "",
+        scale=gauge.statement,
+        scale_sigma=gauge.scale_sigma,
+        known_distances=told_distances(told.distances, images),
+        scale_bars=bars.rows() if bars else (),
+        datum=gauge.datum,
+        warnings=[
+            *(*told.notes, *seen.warnings, *filter(None, [gauge.warning])),
+            *(bars.warnings() if bars else ()),
+        ],
+    )
+    return JoinedModel(
+        reconstruction=group.reconstruction,
+        models=tuple(group.world_from),
+        joins=tuple(told.joins),
+        cameras=cameras,
+        pairs=checked.pairs,
+        facts=facts,
+    )

@@ -72,8 +72,7 @@ class LengthFacts(Record):
     def interval(self) -> str:
         """The length with its interval, and the worst direction, in words."""
         along = name_direction(np.array(self.worst_direction), has_up=self.has_up)
-        digits = max(1 - math.floor(math.log10(self.half_width)), 0) if self.half_width > 0.0 else 6
-        within = f"{self.length:.{digits}f} ± {self.half_width:.{digits}f} (95 %)"
+        within, digits = within_95(self.length, self.half_width), digits_of(self.half_width)
         return f"{within}, worst direction {along} (± {self.worst_half_width:.{digits}f})"
 
     def said(self, half_width: float) -> str:
@@ -118,6 +117,17 @@ class LengthsFacts(Record):
             Row("scale bars", [one.line for one in self.scale_bars]),
             Row("warning", self.warnings),
         ]
+
+
+def digits_of(half_width: float) -> int:
+    """Return how many digits behind the point show two of half an interval."""
+    return max(1 - math.floor(math.log10(half_width)), 0) if half_width > 0.0 else 6
+
+
+def within_95(length: float, half_width: float) -> str:
+    """Return a length with the interval that holds it with a probability of 95 %, in words."""
+    digits = digits_of(half_width)
+    return f"{length:.{digits}f} ± {half_width:.{digits}f} (95 %)"
 
 
 def name_direction(direction: FloatArray, *, has_up: bool) -> str:

@@ -16,13 +16,7 @@ from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted, reasons_by_place
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.joins import JoinFacts
-from sfm_shapefit.facts.model import (
-    Component,
-    DatabaseInputs,
-    JoinedFacts,
-    MapFacts,
-    next_of_model,
-)
+from sfm_shapefit.facts.model import Component, DatabaseInputs, JoinedFacts, MapFacts, next_of_model
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Stated, Table, Tabled
 from sfm_shapefit.judgement.grade import FEW_PLACED, in_another_model

@@ -1,4 +1,4 @@
-"""A model as it stands, with its points and their tracks: adjusted, or asked for its errors."""
+"""A model as it stands: its points and their tracks, adjusted or asked for errors; points of its pictures."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -8,15 +8,21 @@ import numpy as np
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.run import begin, solve_known_points
-from sfm_shapefit.adjustment.sources import collect_tracks
+from sfm_shapefit.adjustment.sources import collect_matches, collect_tracks
+from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.base.executors import Crew
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.model_arrays import ModelArrays
 from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
 from sfm_shapefit.files.colmap.reconstructions import arrays_of, moved_reconstruction
+from sfm_shapefit.judgement.pair_fits import PairFits
+from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.matches import is_among
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
+from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.links import ObservedTracks
 from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
@@ -61,3 +67,14 @@ def estimate_errors(model: ColmapModel) -> tuple[Images, Points, Estimate | None
     problem = run.problem(tracks, TriangulatedPoints.of_tracks(tracks, points.xyz))
     scale_px = run.choose_scale(problem) * options.max_reprojection_error_px
     return images, points, replace(run, loss_scale_px=scale_px).estimate(problem)
+
+
+def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:
+    """Return the points that matches make where the cameras stand, but for those of contradicting pairs."""
+    images, view = source.images, source.view
+    pictures = ModelKeypoints(images, view.keypoints, view.num_keypoints)
+    links = view.links(chosen=~is_among(view.pairs, fits.sides[1]))
+    matches = collect_matches(images, pictures, np.arange(images.num_images), links, view.num_matches)
+    options = StructureOptions()
+    points = triangulate(images, matches, options)
+    return Structure(filter_points(points, images, pictures, options), images, pictures)

@@ -31,13 +31,7 @@ from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import is_among
 
-_SAID_OF_MATCHES = (
-    "num_inliers",
-    "num_rivals",
-    "cheirality_fraction",
-    "median_residual_px",
-    "parallax_deg",
-)
+_SAID_OF_MATCHES = ("num_inliers", "num_rivals", "cheirality_fraction", "median_residual_px", "parallax_deg")
 
 
 def pull_cameras(state: ModelState) -> ModelState:

@@ -37,10 +37,7 @@ _MOST_ASKED = 200  # images of a lens that are left out; each takes 1.4 ms, and 
 
 
 def gather_evidence(
-    source: MatchSource,
-    fits: PairFits | None,
-    structure: Structure,
-    threads: int,
+    source: MatchSource, fits: PairFits | None, structure: Structure, threads: int
 ) -> ModelEvidence:
     """Return the evidence against a model that its fit did not use.
 

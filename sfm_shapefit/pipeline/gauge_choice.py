@@ -16,11 +16,7 @@ from sfm_shapefit.facts.control_points import control_rows, control_warnings
 from sfm_shapefit.facts.scale_bars import measure_bars
 from sfm_shapefit.files.colmap.marks import look_at_marks
 from sfm_shapefit.pipeline.state import ModelState
-from sfm_shapefit.placement.control_points import (
-    control_gauge,
-    fit_control_points,
-    triangulate_marks,
-)
+from sfm_shapefit.placement.control_points import control_gauge, fit_control_points, triangulate_marks
 from sfm_shapefit.placement.gauge_rule import resized_gauge, say_unused
 from sfm_shapefit.placement.prior_refinement import PULLED
 from sfm_shapefit.scene.given import ControlPoints, Gravity, ScaleBars

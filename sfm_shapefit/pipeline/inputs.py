@@ -185,9 +185,7 @@ def read_left_out(inputs: Inputs, names: Collection[str], without: str) -> Input
 
 
 def choose_inputs(
-    reconstruction: ModelSource,
-    database: Path | str | None,
-    source: Source = "auto",
+    reconstruction: ModelSource, database: Path | str | None, source: Source = "auto"
 ) -> Inputs:
     """Decide where directions come from, and say how; those of a result from the database that it is of."""
     database = database or getattr(reconstruction, "database", None)

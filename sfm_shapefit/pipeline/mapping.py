@@ -11,6 +11,7 @@ from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import flat_values
+from sfm_shapefit.facts.joined_cameras import JoinInputs
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.result import LocateResult
@@ -18,9 +19,9 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.components import MapContext, pairs_among
+from sfm_shapefit.pipeline.components import MapContext
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, see_matches
-from sfm_shapefit.pipeline.model_joins import JoinInputs, judge_joins, merge_groups, tell_group
+from sfm_shapefit.pipeline.model_joins import judge_joins, merge_groups, tell_group
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.remedies import at_one_center, make_model
 from sfm_shapefit.pipeline.starts import adjust_first_placement
@@ -28,6 +29,7 @@ from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.place import ContradictedOffsetsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.components import pairs_among
 from sfm_shapefit.rotations.sequences import Loop
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.images import Images

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sfm_shapefit.adjustment.run import FINE_TIMES, MOST_WHOLE
+from sfm_shapefit.adjustment.run import FINE_TIMES, MOST_FRAMES, MOST_WHOLE
 from sfm_shapefit.adjustment.solve import MANY_ENTRIES
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
@@ -47,11 +47,12 @@ _BLOCK = 9  # entries of a block of the factor; three coordinates by three
 _OBSERVATIONS_OF_A_MATCH = 0.7  # observations for a match, if keypoints are more; .45 to .66 measured
 _OBSERVATION_BYTES = 420.0  # bytes of an observation; its track, and its part of the normal equations
 _DIVIDED_BYTES = 270.0  # the same where adjustments are divided: a part has normal equations at a time
-_KEPT_BYTES, _ENTRY_BYTES = 60.0, 150.0  # bytes of an observation of few tracks; with its point, linearized
+_CHOSEN_BYTES, _KEPT_BYTES, _ENTRY_BYTES = 30.0, 75.0, 150.0
+"""Bytes of an observation of few tracks: while these are chosen; laid out; and of its equations beside."""
 _OVERSHOT = 1.2  # observations of few tracks for each that an image wants; 1.13 measured
-_THIN_PAIRS, _THIN_FACTOR = 1.9, 1.8
+_THIN_PAIRS, _THIN_FACTOR = 1.9, 1.9
 """Pairs of cameras that meet in few tracks, for each of the graph; blocks of their factor, likewise."""
-_ITERATIVE_BYTES = 30e3  # bytes of a camera; the factors of its blocks in the preconditioner
+_ITERATIVE_BYTES = 70e3  # bytes of a camera; the factors of its blocks and of the coarse system
 _AVERAGED_BLOCKS, _AVERAGED_FACTORS = 10.0, 1.2
 """Blocks that averaging holds for each pair; for each block of the factor too, with its update matrices."""
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000  # unknowns of an adjusted camera; up to as many, their system is dense
@@ -162,8 +163,9 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
     if work.num_keypoints <= MOST_KEYPOINTS:
         in_memory += PIXEL_BYTES * work.num_keypoints
     throughout = _STARTED_BYTES + _KERNELS_BYTES + model + rays + results + in_memory
+    reading = _STARTED_BYTES + 30e6 + _READ_BYTES * work.num_keypoints
     peaks = {
-        "reading": _STARTED_BYTES + 30e6 + _READ_BYTES * work.num_keypoints,
+        "reading": throughout - rays if work.averages else reading,
         "measuring directions": throughout + batch,
     }
     if work.averages:
@@ -185,10 +187,11 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
         tracks -= in_memory
     seeded = throughout + kept + 300.0 * work.num_edges + tracks
     if work.averages:
-        few, solving = _first_placement_bytes(work, plan)
+        observations, solving = _adjusted_thinly(work, plan)
         given_up = in_memory if work.num_matches > MOST_BESIDE_TRACKS else 0.0
-        peaks["triangulating a first placement"] = seeded - rays + few
-        peaks["adjusting a first placement"] = throughout - rays - given_up + few + solving
+        peaks["triangulating a first placement"] = seeded - rays + _CHOSEN_BYTES * observations
+        solving += throughout - rays - given_up
+        peaks["adjusting a first placement"] = solving + _KEPT_BYTES * observations
     if work.adjusts_bundle or (work.adjusts and plan.adjustment):
         observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches)
         size = _DIVIDED_BYTES if plan.divides else _OBSERVATION_BYTES
@@ -198,20 +201,21 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
     return peaks
 
 
-def _first_placement_bytes(work: Workload, plan: MemoryPlan) -> tuple[float, float]:
-    """Return the bytes of the few tracks that are adjusted, and of the equations and the factor beside these.
+def _adjusted_thinly(work: Workload, plan: MemoryPlan) -> tuple[float, float]:
+    """Return the observations of the few tracks that are adjusted, and the bytes of equations and factor.
 
     Many observations are not linearized while there is a factor; where divided, those of a part alone.
     """
     most = _OVERSHOT * wanted_observations(work.num_images, FINE_TIMES) * work.num_images
     observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches, most)
-    kept = _KEPT_BYTES * observations
     entries, block = _ENTRY_BYTES * observations, 8.0 * _UNKNOWNS**2
     system = 2.0 * block * _THIN_PAIRS * work.num_pairs
     if plan.divides or work.num_images > MOST_WHOLE:
-        return kept, system + _ITERATIVE_BYTES * work.num_images
-    solving = system + 0.5 * block * _THIN_FACTOR * work.factor_entries  # the factor has numbers of 32 bits
-    return kept, max(entries, solving) if observations > MANY_ENTRIES else entries + solving
+        return observations, system + _ITERATIVE_BYTES * work.num_images
+    # The factor has numbers of 32 bits; up to so many frames one of 64 follows, with its selected inverse.
+    copies = 2.2 if work.num_images <= MOST_FRAMES else 0.5
+    solving = system + copies * block * _THIN_FACTOR * work.factor_entries
+    return observations, max(entries, solving) if observations > MANY_ENTRIES else entries + solving
 
 
 def _adjusted_cameras_bytes(work: Workload) -> float:

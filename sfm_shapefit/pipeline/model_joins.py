@@ -9,24 +9,18 @@ Nothing is placed anew. What the models know of their own cameras is kept, see `
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.scale_bars import fit_scale_bars
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.clock import Clock
-from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
-from sfm_shapefit.facts.joined_cameras import JoinedGroup, joined_camera_rows, joined_verdict
+from sfm_shapefit.facts.joined_cameras import JoinedGroup, JoinInputs, tell_joined
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.map_result import JoinedModel
-from sfm_shapefit.facts.model import JoinedFacts
-from sfm_shapefit.facts.placed import UNITS, KeyFigures
-from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.scale_bars import compare_bars
-from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import transform_model
@@ -35,34 +29,12 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.placement.gauge import ARBITRARY, Gauge
-from sfm_shapefit.placement.gauge_options import KnownDistance
 from sfm_shapefit.placement.gauge_rule import gauge_of_distances, resized_gauge
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
-from sfm_shapefit.placement.prior_join import PlacedByPriors, join_by_priors, place_by_priors
-from sfm_shapefit.scene.given import PositionPriors, ScaleBars
+from sfm_shapefit.placement.prior_join import join_to_earlier, try_priors
+from sfm_shapefit.scene.given import PositionPriors
 
-_SIGMA_OF = (
-    "joined: what the models know of their cameras, and how well the joins are known; relative to the mean "
-    "position and scale of the first"
-)
 _SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
-
-
-class JoinInputs(NamedTuple):
-    """What is known of joined models beside the models."""
-
-    joins: Sequence[JoinFacts]
-    """What came of joining each model to another."""
-    options: Mapping[str, Any]
-    inputs: Inputs
-    """Where matches come from."""
-    distances: Sequence[KnownDistance] = ()
-    bars: ScaleBars | None = None
-    """Scale bars with their marks in the images of the group."""
-    located: Mapping[int, LocateResult] = MappingProxyType({})
-    """The models by number, as far as they are ours, with what is known of their cameras."""
-    notes: Sequence[str] = ()
-    """What was read otherwise than it stands in the models."""
 
 
 def judge_joins(
@@ -71,11 +43,11 @@ def judge_joins(
     """Yield what comes of joining each piece but the first: by pairs, or else by `priors` of its cameras."""
     outcomes = join_pieces(tied.cameras, tied.ties)
     usable = [] if tied.cameras.is_metric.any() else priors
-    placed = [_on_priors(tied.cameras.centers_of(k), one) for k, one in enumerate(usable)]
+    placed = [try_priors(tied.cameras.centers_of(k), one) for k, one in enumerate(usable)]
     for number in range(1, len(pieces)):
         done = outcomes[number]
         if placed and (not isinstance(done, PieceJoin) or done.reason):
-            other = _join_by_priors(number, placed)
+            other = join_to_earlier(number, placed)
             done = other if isinstance(other, PieceJoin) or done == UNTIED else done
         join = _at_known_scale(pieces, done) if isinstance(done, PieceJoin) else None
         pairs = [] if join is None else tied.ties.matches.pairs[join.rivals].tolist()
@@ -96,28 +68,6 @@ def _at_known_scale(pieces: Sequence[ModelPiece], join: PieceJoin) -> PieceJoin:
     # Errors of the size of the second model move its cameras about their middle.
     center_sigma = float(np.hypot(join.center_sigma, sigma * median_spread(two[1].model.images.centers)))
     return replace(join, scale_sigma=sigma, center_sigma=center_sigma)
-
-
-def _on_priors(centers: FloatArray, priors: PositionPriors | None) -> PlacedByPriors | str:
-    """Return a piece on the position priors of its cameras, or why it is not placed by them."""
-    try:
-        return UNTIED if priors is None else place_by_priors(centers, priors)
-    except UnsolvableError as error:
-        return str(error)
-
-
-def _join_by_priors(number: int, placed: Sequence[PlacedByPriors | str]) -> PieceJoin | str:
-    """Return the join of a piece to the first of the earlier ones that priors allow, or why there is none."""
-    piece, reasons = placed[number], list[str]()
-    for to, other in enumerate(placed[:number]):
-        if isinstance(piece, str) or isinstance(other, str):
-            reasons.append(piece if isinstance(piece, str) else str(other))
-            continue
-        try:
-            return join_by_priors((to, other), (number, piece))
-        except UnsolvableError as error:
-            reasons.append(str(error))
-    return next((reason for reason in reasons if reason != UNTIED), UNTIED)
 
 
 def merge_groups(
@@ -195,12 +145,8 @@ def _fitting(tied: TiedPieces, pair: int, worlds: Mapping[int, Similarity]) -> t
 def tell_group(
     group: JoinedGroup, join_inputs: JoinInputs, source: MatchSource, options: DirectionOptions, clock: Clock
 ) -> JoinedModel:
-    """Return joined models with what can be said of them; `source` has the matches of their images."""
+    """Return joined models, judged as `check` does; `source` has the matches of their images."""
     first, located = next(iter(group.world_from)), join_inputs.located
-    labels = {
-        k: name for one in group.joins for k, name in ((one.number, one.model), (one.to_number, one.to))
-    }
-    folder = f"joined_{first}" if located else "."
     gauge = Gauge(scale="input", similarity=_SAME, statement="input: those of the first model")
     if first in located:
         gauge, group = _choose_scale(group, located[first].gauge, join_inputs)
@@ -209,42 +155,7 @@ def tell_group(
     tied = np.array([(rows[a], rows[b]) for a, b in group.tied], dtype=np.int64).reshape(-1, 2)
     source = replace(source.at(model.images), tied=tied)
     checked = check_source(model, source, options, clock)
-    seen, measures = checked.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
-    cameras = joined_camera_rows(checked.cameras, group, located)
-    bars = join_inputs.bars and compare_bars(model.images, join_inputs.bars, None, gauge.scale_sigma)
-    facts = JoinedFacts.taken_from(
-        seen,
-        inputs=join_inputs.inputs.facts,
-        options=dict(join_inputs.options),
-        verdict=joined_verdict(seen.verdict, group, located),
-        models=[labels[number] for number in group.world_from],
-        joins=[
-            replace(one, folder=folder if one.joined and one.number in labels else None)
-            for one in join_inputs.joins
-        ],
-        num_images=len(cameras),
-        num_placed=group.reconstruction.num_reg_images(),
-        figures=KeyFigures.of_cameras(cameras, seen.figures.pair_error_deg, *measures),
-        sigma_of=_SIGMA_OF if located else "",
-        scale=gauge.statement,
-        scale_sigma=gauge.scale_sigma,
-        known_distances=told_distances(join_inputs.distances, model.images),
-        scale_bars=bars.rows() if bars else (),
-        datum=gauge.datum,
-        timings_s=clock.seconds,
-        warnings=[
-            *(*join_inputs.notes, *seen.warnings, *filter(None, [gauge.warning])),
-            *(bars.warnings() if bars else ()),
-        ],
-    )
-    return JoinedModel(
-        reconstruction=group.reconstruction,
-        models=tuple(group.world_from),
-        joins=tuple(join_inputs.joins),
-        cameras=cameras,
-        pairs=checked.pairs,
-        facts=facts,
-    )
+    return tell_joined(group, join_inputs, checked, gauge)
 
 
 def _choose_scale(group: JoinedGroup, first: Gauge, join_inputs: JoinInputs) -> tuple[Gauge, JoinedGroup]:

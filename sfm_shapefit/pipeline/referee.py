@@ -16,61 +16,36 @@ to be looked at.
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit import __version__
-from sfm_shapefit.adjustment.sources import collect_matches, collect_tracks
-from sfm_shapefit.adjustment.structure import triangulate
-from sfm_shapefit.base.arrays import BoolArray, distinct
+from sfm_shapefit.adjustment.sources import collect_tracks
+from sfm_shapefit.base.arrays import distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.facts.check_result import CheckResult, checked_camera_rows, checked_pair_rows
-from sfm_shapefit.facts.map_result import MapResult
+from sfm_shapefit.facts.check_result import CheckResult, OtherModel, checked_camera_rows, checked_pair_rows
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import contradicting, model_options
 from sfm_shapefit.files.colmap.model import ColmapModel
-from sfm_shapefit.files.colmap.points import ModelKeypoints, structure_of
+from sfm_shapefit.files.colmap.points import structure_of
 from sfm_shapefit.judgement.check_reasons import CheckedModel, of_alike_pictures, reasons_against
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, find_weak_images, image_quality
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
-from sfm_shapefit.judgement.reasons import (
-    Kind,
-    ModelVerdict,
-    Reason,
-    of_model,
-)
+from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_model
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.pairs.direction_options import DirectionOptions
+from sfm_shapefit.pipeline.bundle import points_of_pictures
 from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import is_among
 from sfm_shapefit.scene.structure import Structure
-from sfm_shapefit.tracks.filter import filter_points
-from sfm_shapefit.tracks.structure_options import StructureOptions
-
-
-class OtherModel(NamedTuple):
-    """Another model of the same matches, to compare with."""
-
-    images: Images
-    """Where it has the images."""
-    fits: PairFits
-    """How pairs fit it."""
-    doubted: BoolArray
-    """(n,) images that may stand elsewhere by their own matches."""
-    source: MapResult
-    """What it is one of."""
-    number: int
-    """Which of these it is."""
-
 
 _LATER: Any = None
 """In place of what a later stage finds out."""
@@ -124,7 +99,7 @@ def read_structure(state: CheckState, clock: Clock) -> CheckState:
         images = state.images
         structure = structure_of(state.model.arrays, images)
         quality = image_quality(*structure[:3])
-        weak = tuple(find_weak_images(images, quality))
+        weak = tuple(find_weak_images(state.images, quality))
         return replace(state, structure=structure, quality=quality, weak=weak)
 
 
@@ -244,14 +219,3 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
 
 def _median(values: list[float]) -> float:
     return float(np.median(values)) if values else np.nan
-
-
-def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:
-    """Return the points that matches make where the cameras stand, but for those of contradicting pairs."""
-    images, view = source.images, source.view
-    pictures = ModelKeypoints(images, view.keypoints, view.num_keypoints)
-    links = view.links(chosen=~is_among(view.pairs, fits.sides[1]))
-    matches = collect_matches(images, pictures, np.arange(images.num_images), links, view.num_matches)
-    options = StructureOptions()
-    points = triangulate(images, matches, options)
-    return Structure(filter_points(points, images, pictures, options), images, pictures)

@@ -35,9 +35,7 @@ _MATCHES_PER_TASK = 100_000  # matches; about a second of work, be they of many 
 
 
 def measure_rotations(
-    view: View,
-    min_matches: int = LEAST_MATCHES,
-    clock: Clock | None = None,
+    view: View, min_matches: int = LEAST_MATCHES, clock: Clock | None = None
 ) -> RelativeRotations:
     """Return relative rotations estimated from matches; pairs are indices into the view's images.
 
@@ -62,11 +60,7 @@ def measure_rotations(
 
 
 def estimate_near(
-    batch: RayMatches,
-    threads: int = 1,
-    *,
-    are_many: bool,
-    rotations: FloatArray,
+    batch: RayMatches, threads: int = 1, *, are_many: bool, rotations: FloatArray
 ) -> RelativeRotations:
     """Return the relative rotations of pairs, near those of rotations (n, 3, 3) where the matches fit there.
 

@@ -6,6 +6,7 @@ deviations are those of a jackknife, which leaves out one prior after the other:
     variance = (m - 1) / m sum_i (theta_i - theta)^2        (Efron, Stein 1981, "The jackknife")
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from sfm_shapefit.base.geometry import (
 )
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.placement.gauge import fit_to_priors, prior_gauge
-from sfm_shapefit.placement.join import FEWEST_PAIRS, PieceJoin, uncertainty
+from sfm_shapefit.placement.join import FEWEST_PAIRS, UNTIED, PieceJoin, uncertainty
 from sfm_shapefit.scene.given import PositionPriors
 
 _MOST_FITS = 12  # groups by which priors are left out; each is a fit of its own
@@ -97,3 +98,25 @@ def join_by_priors(first: tuple[int, PlacedByPriors], second: tuple[int, PlacedB
 
 def _chain(priors_from_first: Similarity, priors_from_second: Similarity) -> Similarity:
     return compose(invert(priors_from_first), priors_from_second)
+
+
+def try_priors(centers: FloatArray, priors: PositionPriors | None) -> PlacedByPriors | str:
+    """Return a piece on the position priors of its cameras, or why it is not placed by them."""
+    try:
+        return UNTIED if priors is None else place_by_priors(centers, priors)
+    except UnsolvableError as error:
+        return str(error)
+
+
+def join_to_earlier(number: int, placed: Sequence[PlacedByPriors | str]) -> PieceJoin | str:
+    """Return the join of a piece to the first of the earlier ones that priors allow, or why there is none."""
+    piece, reasons = placed[number], list[str]()
+    for to, other in enumerate(placed[:number]):
+        if isinstance(piece, str) or isinstance(other, str):
+            reasons.append(piece if isinstance(piece, str) else str(other))
+            continue
+        try:
+            return join_by_priors((to, other), (number, piece))
+        except UnsolvableError as error:
+            reasons.append(str(error))
+    return next((reason for reason in reasons if reason != UNTIED), UNTIED)

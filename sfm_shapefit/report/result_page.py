@@ -32,7 +32,7 @@ def _drawing_of(found: Any) -> Drawing:
     if isinstance(found, JoinedModel):
         return draw_joined(found)
     if isinstance(found, CheckResult):
-        return draw_checked(found.model, found.cameras, found.pairs, found.quality)
+        return draw_checked(found)
     return draw_result(found)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_shapefit.facts.check_result import CheckResult
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.result import GraphResult, LocateResult
@@ -51,13 +52,11 @@ def draw_joined(found: JoinedModel) -> Drawing:
     return _draw_as_it_stands(read_model(found.reconstruction), found.cameras, found.pairs)
 
 
-def draw_checked(
-    model: ColmapModel, cameras: Table[CameraRow], pairs: Table[PairRow], quality: ImageQuality
-) -> Drawing:
+def draw_checked(found: CheckResult) -> Drawing:
     """Return the drawing of a model that was judged, with how well points hold each of its images."""
-    drawing = _draw_as_it_stands(model, cameras, pairs)
+    quality, drawing = found.quality, _draw_as_it_stands(found.model, found.cameras, found.pairs)
     points = drawing.points._replace(errors_px=quality.point_errors_px, lengths=quality.point_track_lengths)
-    return replace(drawing, further=tuple(_columns(quality, len(cameras))), points=points)
+    return replace(drawing, further=tuple(_columns(quality, len(found.cameras))), points=points)
 
 
 def draw_model(model: ColmapModel, trust: Mapping[str, float]) -> Drawing:

@@ -93,7 +93,7 @@ def average_rotations(
             None, all pairs are alike.
         num_images: n; one more than the largest index if None.
         weights: (k,) how many matches stand behind each pair; all alike if None.
-        threads: threads of factorizations.
+        threads: threads that share the work.
 
     Source: see `rotations.annealing`, `rotations.averaging_uncertainty` and `rotations.dual_certificate`.
     """

@@ -84,18 +84,24 @@ def _level(off: FloatArray) -> float:
     return float(np.median(off[near])) / _MEDIAN_LENGTH if near.any() else 0.0
 
 
-def with_gravity(averaged: AveragedRotations, given: AveragingPairs, gravity: Gravity) -> AveragedRotations:
+def refine_with_gravity(
+    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
+) -> AveragedRotations:
     """Return averaged rotations refined on pairs and gravities together, in a world whose z points up.
 
     Args:
         averaged: rotations of n images, by the pairs alone.
-        given: the pairs, among these images.
+        relative: the pairs, among these images.
         gravity: gravities of images that have a rotation; with fewer than two `averaged` is returned.
     """
     members = np.flatnonzero(averaged.registered).astype(np.int64)
     gravities = gravity.of(members)
     if len(gravities.indices) < FEWEST_GRAVITIES:
         return averaged
+    supports = relative.weight_shares * relative.num_matches
+    given = check_pairs(
+        relative.pairs, relative.rotations, relative.information, supports, len(averaged.registered)
+    )
     upright = averaged.rotations @ turn_upright(down_of(averaged.rotations[members], gravities)).T
     inside: BoolArray = np.asarray(averaged.registered[given.pairs].all(axis=1))
     inner = given.subset(inside)
@@ -203,13 +209,3 @@ def _shortest_turns(sources: FloatArray, target: FloatArray) -> Rotation:
     axes[opposite] = np.cross(target, np.eye(3)[int(np.argmin(np.abs(target)))])
     angles = angle_between(sources, np.broadcast_to(target, sources.shape))
     return Rotation.from_rotvec(angles[:, None] * normalized(axes))
-
-
-def refine_with_gravity(
-    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
-) -> AveragedRotations:
-    """Return averaged rotations of frames refined on their pairs and gravities together."""
-    supports = relative.weight_shares * relative.num_matches
-    count = len(averaged.registered)
-    given = check_pairs(relative.pairs, relative.rotations, relative.information, supports, count)
-    return with_gravity(averaged, given, gravity)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.facts.check_result import OtherModel
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -14,15 +15,14 @@ from sfm_shapefit.judgement.image_quality import find_weak_images
 from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.judgement.reasons import Grade, Kind, of_each
 from sfm_shapefit.pairs.direction_options import DirectionOptions
+from sfm_shapefit.pipeline.bundle import points_of_pictures
 from sfm_shapefit.pipeline.referee import (
     CheckState,
-    OtherModel,
     compare_with_other,
     finish_check,
     fit_directions,
     gather_evidence_against,
     grade_model,
-    points_of_pictures,
     read_structure,
 )
 from tests.judgement.made import opinion_with

@@ -5,8 +5,9 @@ import pytest
 
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.pipeline.components import ComponentAveraging, PairScores
+from sfm_shapefit.pairs.pair_scores import PairScores
 from sfm_shapefit.rotations.averaging_options import AveragingOptions
+from sfm_shapefit.rotations.components import ComponentAveraging
 from tests.problems import made_rotations
 
 
@@ -15,7 +16,7 @@ def averaged(pairs, weight_shares, **options):
     rotations = np.tile(np.eye(3), (len(pairs), 1, 1))
     relative = made_rotations(pairs, rotations, weight_shares=np.array(weight_shares))
     reasons: dict[int, str] = {}
-    components = ComponentAveraging(AveragingOptions(**options), Clock(), gravity=None)
+    components = ComponentAveraging(AveragingOptions(**options), threads=1, gravity=None)
     found = list(components.average(int(np.max(pairs)) + 1, relative, reasons))
     return [frames.tolist() for frames, _ in found], reasons
 

@@ -19,6 +19,7 @@ from sfm_shapefit.judgement.image_quality import image_quality
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
+from sfm_shapefit.report.results import draw_checked
 from tests.facts.test_schema import problems
 from tests.judgement.made import opinion_with, place_of
 from tests.program import run, run_refused
@@ -45,14 +46,14 @@ def test_quality_is_that_of_the_models_own_observations():
 
 def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path, ring_mapped):
     found = check(RING / "sparse" / "0", second_opinion=ring_mapped)
-    drawing, facts = found.drawing, found.facts
+    drawing, facts = draw_checked(found), found.facts
     assert facts.verdict.statement == "good"
     assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
     assert " workspace " in banner(drawing, facts)["command"]
 
     moved, name = with_one_displaced(tmp_path / "moved")
     found = check(moved, RING / "database.db", second_opinion=ring_mapped)
-    drawing, facts = found.drawing, found.facts
+    drawing, facts = draw_checked(found), found.facts
     assert facts.verdict.cameras == (name,)
     row = drawing.cameras.names.index(name)
     assert "pairs contradict its place" in drawing.cameras.reasons[row]
@@ -102,7 +103,7 @@ def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_
     image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, away)
     moved.write(tmp_path)
     found = check(tmp_path, COURTYARD / "database.db", second_opinion=courtyard_mapped)
-    drawing, facts = found.drawing, found.facts
+    drawing, facts = draw_checked(found), found.facts
     assert image.name in facts.verdict.cameras
     assert "its reprojection error is" in drawing.cameras.reasons[drawing.cameras.names.index(image.name)]
 
@@ -121,7 +122,9 @@ def test_what_map_doubts_check_does_not_call_good():
             in found.facts.evidence.second.statement
         )
         assert " workspace " in found.facts.next_step.command  # it would be placed there again
-        assert banner(found.drawing, found.facts)["sentence"].startswith("0004.jpg, 0005.jpg may be wrong")
+        assert banner(draw_checked(found), found.facts)["sentence"].startswith(
+            "0004.jpg, 0005.jpg may be wrong"
+        )
         evidence = found.facts.evidence
         unlike = replace(evidence, second=replace(evidence.second, usual=0.2, ambiguous=()))
         # Both are to be looked at, so that nothing is for the one that is checked.

@@ -7,7 +7,7 @@ from numba.core import config
 
 from sfm_shapefit.base import kernel_cache
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.commands import examples
+from sfm_shapefit.commands import examples, part_examples
 from sfm_shapefit.commands import warm_up as module
 from sfm_shapefit.commands.warm_up import FURTHER, NEEDED, WarmUp, compile_together, not_done, warm_up
 from tests.program import run, run_python
@@ -16,8 +16,10 @@ from tests.program import run, run_python
 def test_every_example_is_run():
     defined = [
         name
-        for name, value in vars(examples).items()
-        if python_inspect.isfunction(value) and value.__module__ == examples.__name__ and name[0] != "_"
+        for source in (examples, part_examples)
+        for name, value in vars(source).items()
+        if python_inspect.isfunction(value) and value.__module__ == source.__name__ and name[0] != "_"
+        if [one.lstrip("_") for one in python_inspect.signature(value).parameters] == ["folder"]
     ]
     assert sorted(defined) == sorted(NEEDED + FURTHER)
 
@@ -26,11 +28,11 @@ HEAR = """
 import sys, tempfile
 from pathlib import Path
 from sfm_shapefit.base.kernel_cache import hear_of_kernels
-from sfm_shapefit.commands import examples
+from sfm_shapefit.commands import part_examples
 heard = set()
 with hear_of_kernels(heard.add), tempfile.TemporaryDirectory() as folder:
     for name in ("solve_sparse", "solve_by_splitting", "solve_iteratively"):
-        getattr(examples, name)(Path(folder))
+        getattr(part_examples, name)(Path(folder))
 print(*heard)
 """
 
