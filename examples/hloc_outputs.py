@@ -17,11 +17,15 @@ Needs h5py.
 import sys
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pycolmap
 
 import sfm_shapefit
+
+try:
+    import h5py
+except ModuleNotFoundError:
+    sys.exit("hloc's files are read by h5py, which is not installed: pip install h5py")
 
 
 def pair_key(file: h5py.File, name0: str, name1: str) -> tuple[str, bool]:

@@ -59,7 +59,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "factors": (
         tuple(f"laplacian/{name}.py" for name in ("factor", "blocks", "operators", "superlu")),
-        ("laplacian", "selected_inverse", "iterative"),
+        ("blocks", "laplacian", "selected_inverse", "iterative"),
     ),
     "judgement": (
         tuple(

@@ -92,6 +92,13 @@ def test_an_example_without_arguments_says_how_it_is_called(name):
     assert "Traceback" not in done.stderr
 
 
+def test_the_example_for_hloc_says_which_package_it_lacks():
+    path = ROOT / "examples/hloc_outputs.py"
+    done = run_python("-c", f"import runpy, sys; sys.modules['h5py'] = None; runpy.run_path({str(path)!r})")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "pip install h5py" in done.stderr
+
+
 @pytest.mark.parametrize("name", sfm_shapefit.__all__)
 def test_every_public_name_says_what_it_is_and_what_it_takes(name):
     public = getattr(sfm_shapefit, name)

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
 _NAMED = 3  # names; a longer list is counted, so that a sentence stays one
+_MOST_PX = 10_000  # pixels; a larger error says that the pose is wrong, and no more
 _FEWEST = 3  # images of a folder or clip; fewer are named one by one
 
 
@@ -68,6 +69,11 @@ def rounded(value: float, smallest: float = 1e-9, digits: int = 4) -> str:
     if 10.0**digits <= abs(value) < 1e6:
         return f"{value:.0f}"  # no power of ten
     return "0" if abs(value) < smallest else f"{value:.{digits}g}"
+
+
+def in_pixels(error_px: float, digits: int) -> str:
+    """Return an error with so many decimals and its unit; points beside or behind a camera have huge ones."""
+    return f"{error_px:.{digits}f} px" if error_px <= _MOST_PX else f"above {_MOST_PX:,} px"
 
 
 def label_lens(camera: int, image: str, num_images: int) -> str:

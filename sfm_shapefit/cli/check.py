@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
     print_answer,
@@ -35,6 +35,7 @@ from sfm_shapefit.cli.root import app
 
 if TYPE_CHECKING:
     from sfm_shapefit.facts.check_result import CheckResult
+    from sfm_shapefit.facts.checked_pieces import CheckedPieces
 
 
 @app.command(
@@ -76,7 +77,9 @@ def check_command(
         bool, typer.Option("--no-second-opinion", help="Make none of the database, and compare with none.")
     ] = False,
     as_json: Json = False,
-    strict: Annotated[bool, typer.Option("--strict", help=f"{STRICT_HELP}.")] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help=f"{STRICT_HELP}, or without matches to check by.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Judge the poses of MODEL as they stand, whatever program made it; MODEL is not changed.
@@ -94,8 +97,10 @@ def check_command(
                 {"--report": report, "--second-opinion": second_opinion, "--images": images}
                 | {"--scale-bars": scale_bars}
             )
-            is_usable = _check_pieces(source, database, not no_second_opinion, as_json=as_json, quiet=quiet)
-            raise typer.Exit(EXIT_UNSOLVABLE if strict and not is_usable else 0)
+            pieces = _check_pieces(source, database, not no_second_opinion, as_json=as_json, quiet=quiet)
+            if strict:
+                _be_strict(is_usable=bool(pieces.kept), has_matches=pieces.has_matches)
+            return
         refuse_no_model(source)
         from sfm_shapefit.base.atomic_folder import claimed_output
         from sfm_shapefit.commands.check import check
@@ -144,15 +149,26 @@ def check_command(
             print_answer(told)
             written = "" if report is None else f"written to {report}; open {shlex.quote(str(report))}"
             print_ending(found.verdict.grade.value, found.verdict.statement, written, told.step.command)
-        if strict and not found.verdict.is_usable:
-            raise typer.Exit(EXIT_UNSOLVABLE)
+        if strict:
+            _be_strict(is_usable=found.verdict.is_usable, has_matches=found.facts.has_matches)
+
+
+def _be_strict(*, is_usable: bool, has_matches: bool) -> None:
+    """End with exit code 4 unless a model can be used, and was compared with matches."""
+    if is_usable and not has_matches:
+        raise UnsolvableError(
+            "--strict: the model was checked by its own tracks alone, which cannot show a fold; give its "
+            "database (--database) or its photographs (--images)"
+        )
+    if not is_usable:
+        raise typer.Exit(EXIT_UNSOLVABLE)
 
 
 def _refuse_of_many(given: dict[str, Path | None]) -> None:
     """Raise InputError for flags that are of one model, where a folder of several is judged."""
     for flag, path in given.items():
         if path is not None:
-            raise InputError(f"{flag} is of one model; give one of the folder's, or leave it out")
+            raise InputError(f"{flag} needs a single model; give one of those in the folder, or leave it out")
 
 
 def _refuse_without_use(
@@ -187,8 +203,8 @@ def _keep_second(found: "CheckResult", out: Path | None, *, overwrite: bool) -> 
 
 def _check_pieces(
     folder: Path, database: Path | None, second_opinion: bool, *, as_json: bool, quiet: bool
-) -> bool:
-    """Judge the models in a folder, print one table, and return whether one of them is to be kept."""
+) -> "CheckedPieces":
+    """Judge the models in a folder, print one table, and return what was found."""
     from sfm_shapefit.commands.check import check_pieces
     from sfm_shapefit.files.colmap.quiet import hear_pycolmap
 
@@ -201,4 +217,4 @@ def _check_pieces(
         print_answer(told)
         if told.step.command:
             print_lines([f"next: {told.step.command}"])
-    return bool(found.kept)
+    return found

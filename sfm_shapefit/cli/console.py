@@ -43,6 +43,12 @@ _AGAIN_S = 0.02  # seconds after which a lost interrupt comes again; native code
 flag_names, key_names = set[str](), set[str]()
 """Names of the options of the command at work that are flags, and of those that may stand in --config."""
 
+
+def flags_and_keys() -> set[str]:
+    """Return the flags, as they are typed, and the keys of the command at work."""
+    return {f"--{name.replace('_', '-')}" for name in flag_names} | key_names
+
+
 _received: list[int] = []
 """Numbers of the signals that asked this process to end."""
 

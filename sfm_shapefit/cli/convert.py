@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from sfm_shapefit.base.display import NextStep
 from sfm_shapefit.cli.console import print_lines, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, OutputPath, Quiet, one_path
 from sfm_shapefit.cli.root import app
@@ -69,4 +70,5 @@ def convert_command(
         if not quiet:
             beside = f", {', '.join(map(str, written.files[1:]))}" if written.files[1:] else ""
             told = "; ".join(filter(None, [written.format, written.statement]))
-            print_lines([f"written to {target}{beside} ({told})"])
+            step = NextStep("", FORMATS[written.format].step).at(out=target).command
+            print_lines([f"written to {target}{beside} ({told})", f"next: {step}"])

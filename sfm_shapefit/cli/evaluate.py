@@ -1,5 +1,6 @@
 """`sfm-shapefit evaluate MODEL REF`."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,7 +9,7 @@ import typer
 from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import rounded
-from sfm_shapefit.cli.console import print_json, print_table, report_errors
+from sfm_shapefit.cli.console import print_json, print_lines, print_table, report_errors
 from sfm_shapefit.cli.flags import (
     GroupedCommand,
     InputPath,
@@ -115,6 +116,11 @@ def evaluate_command(
         else:
             title = f"{source} against {truth}"
             print_table(title, _told(errors, verbose=verbose or bool(threshold)), "see --json")
+            if source.is_dir():
+                print_lines([f"next: sfm-shapefit check {shlex.quote(str(source))}"])
+            elif csv is None:
+                both = f"{shlex.quote(str(source))} {shlex.quote(str(truth))}"
+                print_lines([f"next: sfm-shapefit evaluate {both} --csv errors.csv"])
 
 
 def _tell_lengths(source: Path, lengths: list[str], bars: Path | None, *, as_json: bool) -> None:
@@ -128,6 +134,11 @@ def _tell_lengths(source: Path, lengths: list[str], bars: Path | None, *, as_jso
             print_json(found.summary())
         else:
             print_table(str(source), found.told(), "see --json")
+            model = shlex.quote(str(source))
+            step = f"evaluate {model} --length PLACE PLACE" if not lengths else f"check {model}"
+            if found.scale_sigma is None and not bars:
+                step = f"locate {model} OUT --known-distance NAME NAME DISTANCE"
+            print_lines([f"next: sfm-shapefit {step}"])
 
 
 def _told(errors: "Evaluation | PositionEvaluation", *, verbose: bool) -> list[Row]:

@@ -4,7 +4,7 @@ import inspect
 import itertools
 import re
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -14,8 +14,8 @@ from typer.core import TyperCommand
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import S, Settings, hint, homes_of, option, setting_groups
-from sfm_shapefit.cli.colmap_names import answer_for
-from sfm_shapefit.cli.console import flag_names, key_names
+from sfm_shapefit.cli.colmap_names import answer_for, answer_for_file
+from sfm_shapefit.cli.console import flag_names, flags_and_keys, key_names
 from sfm_shapefit.cli.root import convert_plainly
 
 Command = TypeVar("Command", bound=Callable[..., None])
@@ -193,7 +193,8 @@ class GroupedCommand(TyperCommand):
         try:
             extra = super().parse_args(ctx, _gather_values(args))
         except typer.BadParameter as error:
-            error.message = error.message.removeprefix("Value error, ")  # typer has it from pydantic
+            said = error.message.removeprefix("Value error, ")  # typer has it from pydantic
+            error.message = said.replace("Input should be", "must be").partition(", unable to parse")[0]
             raise
         if extra and "--database" in known and not ctx.resilient_parsing:
             _refuse_extra(ctx, extra)
@@ -376,17 +377,42 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
 
     refuse_irregular_file(path)
     try:
-        read = tomllib.loads(text_of(path))
+        text = text_of(path)
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
-    except (ValueError, RecursionError) as error:
-        raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
     homes = homes_of(settings)
-    for name in read.keys() - {*homes, *homes.values()}:
-        raise typer.BadParameter(
-            f"{path}: {name!r} {_describe_unknown(name, sorted({*homes, *homes.values()}))}"
-        )
+    known = {*homes, *homes.values()}
+    try:
+        read = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        if answer := answer_for_file(_names_in_ini(text), flags_and_keys()):
+            raise typer.BadParameter(f"{path} {answer}") from error
+        raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
+    unknown = [name for name in read if name not in known]
+    if unknown and (answer := answer_for_file(_names_in(read, unknown), flags_and_keys())):
+        raise typer.BadParameter(f"{path} {answer}")
+    for name in unknown:
+        raise typer.BadParameter(f"{path}: {name!r} {_describe_unknown(name, sorted(known))}")
     return read
+
+
+def _names_in(read: dict[str, Any], chosen: Iterable[str]) -> Iterator[str]:
+    """Yield names of options of a TOML file, those of a table after its name and a point."""
+    for name in chosen:
+        value = read[name]
+        yield from (f"{name}.{key}" for key in value) if isinstance(value, dict) else [name]
+
+
+def _names_in_ini(text: str) -> list[str]:
+    """Return the names of options as COLMAP writes them into a file, none if the text is no such file."""
+    import configparser  # here: few files are refused
+
+    ini = configparser.ConfigParser(interpolation=None, strict=False)
+    try:
+        ini.read_string(f"[ ]\n{text}")  # the first options have no group
+    except configparser.Error:
+        return []
+    return [f"{group}.{name}".lstrip(" .") for group in ini.sections() for name in ini.options(group)]
 
 
 def _describe_unknown(name: str, known: Sequence[str]) -> str:

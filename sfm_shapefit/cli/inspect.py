@@ -47,6 +47,7 @@ def inspect_command(
     """Diagnose the view graph of MODEL and say what `locate` would do; solve and write nothing."""
     source = one_path(model, input_path, "MODEL")
     with report_errors():
+        from sfm_shapefit.base.atomic_folder import MARKER
         from sfm_shapefit.files.model_folder import refuse_no_model
 
         options = read_options(InspectOptions, given, config)
@@ -66,6 +67,8 @@ def inspect_command(
             print_table(f"{counted(found.num_images, what)} of {source}", told.rows, told.elsewhere)
             if not found.diagnosis.obstacle:
                 by = "" if database is None else f" --database {shlex.quote(str(database))}"
+                if (source / MARKER).is_file():  # else the same comes out again
+                    by += " --without FILE"
                 print_lines([f"next: sfm-shapefit {command} {shlex.quote(str(source))} OUT{by}"])
         if found.diagnosis.obstacle:
             raise UnsolvableError(found.diagnosis.obstacle)

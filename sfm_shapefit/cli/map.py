@@ -44,7 +44,7 @@ _FLAGS = (
 @app.command(
     "map",
     cls=GroupedCommand,
-    short_help="Make models from the matches of a COLMAP database.",
+    short_help="Make models from a COLMAP database, or from a folder of images.",
     epilog="Example: sfm-shapefit map images out",
 )
 @takes(flags_of(MapOptions, *_FLAGS), flags_of(MatchingOptions), flags_of(OutputFlags), settings=MapOptions)

@@ -79,7 +79,7 @@ class _ByImportance(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command that is called; one of COLMAP's is answered with what it is here."""
-        if answer := answer_for_command(args[0]):
+        if answer := answer_for_command(*args[:2]):
             ctx.fail(answer)
         return super().resolve_command(ctx, args)
 

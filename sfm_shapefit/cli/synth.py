@@ -1,5 +1,6 @@
 """`sfm-shapefit synth OUT`."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -7,7 +8,7 @@ import typer
 
 from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.cli.console import print_table, report_errors
+from sfm_shapefit.cli.console import print_lines, print_table, report_errors
 from sfm_shapefit.cli.flags import (
     GroupedCommand,
     OutArgument,
@@ -48,6 +49,10 @@ def synth_command(
         exact = "truth" if (target / "truth").exists() else "sparse/0"
         rows += [row("exact model", exact), row("written to", str(target))]
         print_table(f"{scene.shape}, seed {scene.seed}", rows)
+        made = shlex.quote(str(target))
+        pictures = f" --images {made}/images" if images else ""
+        step = f"map {made}/database.db {made}_mapped{pictures}"
+        print_lines([f"next: sfm-shapefit {step if workspace.database else f'check {made}/sparse/0'}"])
 
 
 def _write(options: SceneOptions, target: Path, workspace: WorkspaceOptions) -> list[Row]:

@@ -1,5 +1,7 @@
 """`sfm-shapefit workspace MODEL IMAGES OUT`."""
 
+import shlex
+import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -59,4 +61,15 @@ def workspace_command(
         with show_progress(not quiet, plan=PLANS["MODEL IMAGES OUT"]) as progress:
             made = workspace(source, folder, target, options=options, progress=progress)
         if not quiet:
-            print_lines(made.told)
+            print_lines([*made.told, f"next: {_next(shlex.quote(str(target)))}"])
+
+
+def _next(folder: str) -> str:
+    """Return what to do with a workspace: the command of a program that is there, or else in words."""
+    for program, arguments in (
+        ("ns-train", "splatfacto --data"),
+        ("colmap", "patch_match_stereo --workspace_path"),
+    ):
+        if shutil.which(program):
+            return f"{program} {arguments} {folder}"
+    return f"train splats on {folder}, or give it to OpenMVS"

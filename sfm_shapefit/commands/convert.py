@@ -26,6 +26,8 @@ class ExportFormat(NamedTuple):
 
     help: str
     """What it is, for the help of `convert`."""
+    step: str
+    """What to do with OUT next."""
     suffixes: tuple[str, ...] = ()
     """Suffixes of files that have this format where none is named."""
     text_of: str = ""
@@ -35,18 +37,42 @@ class ExportFormat(NamedTuple):
 
 
 FORMATS = {
-    "colmap": ExportFormat("a folder", ("",)),
-    "colmap-txt": ExportFormat("a folder of text files"),
-    "nerf": ExportFormat("transforms.json of nerfstudio and instant-ngp", (".json",), "nerf:nerf_text"),
+    "colmap": ExportFormat("a folder", "sfm-shapefit check {out}", ("",)),
+    "colmap-txt": ExportFormat("a folder of text files", "sfm-shapefit check {out}"),
+    "nerf": ExportFormat(
+        "transforms.json of nerfstudio and instant-ngp",
+        "train on {out} with nerfstudio or instant-ngp, from the folder of the images",
+        (".json",),
+        "nerf:nerf_text",
+    ),
     "tum": ExportFormat(
-        "a trajectory for evo and SLAM tools", (".tum", ".txt"), "tum:tum_text", is_exact=True
+        "a trajectory for evo and SLAM tools",
+        "sfm-shapefit evaluate {out} REF",
+        (".tum", ".txt"),
+        "tum:tum_text",
+        is_exact=True,
     ),
     "csv": ExportFormat(
-        "name, center and rotation of each camera", (".csv",), "tum:poses_csv", is_exact=True
+        "name, center and rotation of each camera",
+        "read {out} with pandas or a spreadsheet",
+        (".csv",),
+        "tum:poses_csv",
+        is_exact=True,
     ),
-    "glb": ExportFormat("a mesh of cameras and points for 3D viewers", (".glb",)),
-    "ply": ExportFormat("all points, and cameras in a second file", (".ply",), is_exact=True),
-    "covariances": ExportFormat("CSV of the centers' 3 x 3 covariances in an output", is_exact=True),
+    "glb": ExportFormat(
+        "a mesh of cameras and points for 3D viewers", "open {out} in a 3D viewer", (".glb",)
+    ),
+    "ply": ExportFormat(
+        "all points, and cameras in a second file",
+        "open {out} in a viewer of point clouds",
+        (".ply",),
+        is_exact=True,
+    ),
+    "covariances": ExportFormat(
+        "CSV of the centers' 3 x 3 covariances in an output",
+        "read {out} with pandas or a spreadsheet",
+        is_exact=True,
+    ),
 }
 
 _FOLDERS = {"colmap", "colmap-txt"}

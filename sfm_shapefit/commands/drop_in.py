@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.paths import OF_DATABASE
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.commands.map import map_database, measure_run
 from sfm_shapefit.commands.write import WriteOptions, deliver
 from sfm_shapefit.facts.command_options import MapOptions
+from sfm_shapefit.files.colmap.database_cameras import read_cameras
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pipeline.components import start_run
@@ -28,12 +31,8 @@ _TAKEN = {"num_threads": "threads", "min_num_matches": "min_matches", "min_model
 """Options of pycolmap that have a counterpart here, and its name."""
 
 _WITHOUT_EFFECT = {
-    "num_threads",
-    "random_seed",
-    "use_gpu",
-    "gpu_index",
-    "image_path",
-    "refine_sensor_from_rig",
+    *("num_threads", "random_seed", "use_gpu", "gpu_index", "image_path"),
+    *("refine_sensor_from_rig", "constant_rigs", "fix_existing_frames"),
 }
 """Options of pycolmap, wherever they stand, whose other value asks for what is so here anyway."""
 
@@ -66,8 +65,10 @@ def global_mapping(
         options: `MapOptions`, or a mapping of some of them; defaults if None. From pycolmap's options
             `num_threads`, `min_num_matches` and `min_model_size` are taken; where bundle adjustment is not to
             refine focal lengths, intrinsics are "held", distortion too, and where only extra parameters stay,
-            "focal". Seeds, GPUs, threads of single stages and sensors that stay in their rigs need nothing.
-            A warning names all others that are not pycolmap's defaults: they have no effect.
+            "focal". `use_prior_position` and `use_gravity` take those of the database, `constant_cameras`
+            keeps the intrinsics of all cameras. Seeds, GPUs, threads of single stages and sensors that stay
+            in their rigs need nothing. A warning names all others that are not pycolmap's defaults: they have
+            no effect.
         **others: further arguments of `pycolmap.incremental_mapping`, which must be empty.
 
     Returns:
@@ -76,7 +77,7 @@ def global_mapping(
 
     Raises:
         InputError: if the database cannot be used, the output would replace something else, or pycolmap's
-            options choose images by `image_names`.
+            options choose images by `image_names`, or some cameras by `constant_cameras`.
         UnsolvableError: if no component of three images or more can be placed.
         TypeError: for options of another function, or an argument that is not taken.
     """
@@ -85,17 +86,18 @@ def global_mapping(
             raise TypeError(
                 f"global_mapping takes no {name}: {_NOT_TAKEN.get(name, 'it has no such argument')}"
             )
+    priors = None
     if isinstance(options, Mapping):
         options = MapOptions(**options)
     elif options is not None and not isinstance(options, MapOptions):
-        options = _options_of(options)
-    mapped = map_database(database_path, options)
+        options, priors = _options_of(options, Path(database_path))
+    mapped = map_database(database_path, options, priors=priors)
     mapped = deliver(mapped, output_path, WriteOptions(overwrite=True, images=image_path))
     return {number: model.reconstruction for number, model in enumerate(mapped.models)}
 
 
-def _options_of(theirs: "_PycolmapOptions") -> MapOptions:
-    """Return the options of pycolmap that have a counterpart, where they are not its defaults."""
+def _options_of(theirs: "_PycolmapOptions", database: Path) -> tuple[MapOptions, str | None]:
+    """Return options, and where priors are, for those of pycolmap that are not its defaults."""
     if type(theirs).__name__ not in ("GlobalPipelineOptions", "IncrementalPipelineOptions"):
         raise TypeError(
             "options must be MapOptions(...), a mapping of some, or pycolmap's GlobalPipelineOptions or "
@@ -106,15 +108,33 @@ def _options_of(theirs: "_PycolmapOptions") -> MapOptions:
     if "image_names" in changed:
         raise InputError("image_names is not taken: all images are mapped; give a database of these alone")
     values = {ours: changed.pop(name) for name, ours in _TAKEN.items() if name in changed}
+    if fixed := {*changed.pop("constant_cameras", ()), *changed.pop("mapper.constant_cameras", ())}:
+        _refuse_few_cameras(fixed, database)
+        values["intrinsics"] = "held"
+    if changed.pop("mapper.rotation_averaging.use_gravity", False):
+        values["gravity"] = OF_DATABASE
+    priors = OF_DATABASE if changed.pop("use_prior_position", False) else None
     ends = {name: name.rpartition(".")[2].removeprefix("ba_") for name in changed}
     kept = {"refine_focal_length", "refine_extra_params"} & {*ends.values()}
-    if kept:
+    if kept and not fixed:
         values["intrinsics"] = "held" if "refine_focal_length" in kept else "focal"
     lost = [f"{name}={changed[name]}" for name, end in ends.items() if end not in _WITHOUT_EFFECT | kept]
     if lost:
         said = f"these options of pycolmap have no effect: {', '.join(lost)}"
         warnings.warn(f"{said}; docs/coming_from.md says what there is instead", stacklevel=3)
-    return MapOptions(**values)
+    return MapOptions(**values), priors
+
+
+def _refuse_few_cameras(fixed: set[int], database: Path) -> None:
+    """Raise InputError if a database has cameras that are not to be fixed."""
+    with closing(DatabaseFile(database_in(database))) as file:
+        others = sorted(read_cameras(file).usable.keys() - fixed)
+    if others:
+        raise InputError(
+            f"constant_cameras lacks {counted(len(others), 'camera')} of the database, such as {others[0]}, "
+            "and intrinsics are held of all or of none; leave it out, and mark in the database what is "
+            "calibrated (has_prior_focal_length): calibrated lenses stay by default"
+        )
 
 
 def _single_values(options: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:

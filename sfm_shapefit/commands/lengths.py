@@ -79,7 +79,7 @@ def evaluate_lengths(
         warnings=[
             *posed.notes,
             *(bars.warnings() if bars else ()),
-            *(f"how well the distance of {ends} is known is not known; choose others" for ends in unknown),
+            *(f"nothing is known of the error of the distance of {ends}; choose others" for ends in unknown),
         ],
     )
 

@@ -69,6 +69,11 @@ class CheckedPieces(Record, Displayed, repr=False):
         kept = [(one.folder, one.facts) for one in self.pieces if one.keep and one.facts]
         return sorted(kept, key=lambda one: -one[1].num_placed)
 
+    @property
+    def has_matches(self) -> bool:
+        """Whether those to be kept were compared with matches, and not with their own tracks alone."""
+        return all(facts.has_matches for _, facts in self.kept)
+
     def _headline(self) -> str:
         return f"{len(self.kept)} of {len(self.pieces)} models to keep"
 

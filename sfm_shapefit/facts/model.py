@@ -8,7 +8,7 @@ import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from sfm_shapefit.adjustment.estimate import BundleAdjustment, Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, distinct
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted, first_of, rounded
+from sfm_shapefit.base.wording import counted, first_of, in_pixels, rounded
 from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics, describe_intrinsics
 from sfm_shapefit.facts.joins import JoinFacts
@@ -170,7 +170,7 @@ class FactsOfModel(Facts):
     def told_lines(self, against: tuple[int, int], more: str = "") -> list[str]:
         """Return the answer in lines: how many pairs are `against` it, of how many, and `more` of matches."""
         error_px = self.mean_reprojection_error_px
-        points = f", mean reprojection error {error_px:.2f} px" if error_px is not None else ""
+        points = f", mean reprojection error {in_pixels(error_px, 2)}" if error_px is not None else ""
         source = _from_here(self.inputs.database) if self.inputs.database else self.inputs.directions
         contradict = (
             f"{against[0]:,} of {counted(against[1], 'pair')} contradict{'s' * (against[1] == 1)} the result"
@@ -309,7 +309,7 @@ def _how_to_keep(num_not_trusted: int) -> str:
     """Say how to keep images that are left out; empty if there are none."""
     count = counted(num_not_trusted, "image")
     return (
-        f"{count} of these; min_trust=0 keeps {'them' if num_not_trusted > 1 else 'it'}"
+        f"{count} of those above; min_trust=0 keeps {'them' if num_not_trusted > 1 else 'it'}"
         if num_not_trusted
         else ""
     )
@@ -318,10 +318,13 @@ def _how_to_keep(num_not_trusted: int) -> str:
 def next_of_model(grade: Grade, facts: FactsOfModel) -> NextStep:
     """Return what to do with a model of ours, by what it was made of."""
     inputs = facts.inputs
-    if grade is Grade.DO_NOT_USE:
-        model = "{out}" if inputs.model == IN_MEMORY else shlex.quote(inputs.model)  # `map` has no other
-        step = f"sfm-shapefit inspect {model}{inputs.database_flag}"
+    if grade is Grade.DO_NOT_USE and inputs.model == IN_MEMORY:  # as `map` has it
+        step = f"sfm-shapefit inspect {{out}}{inputs.database_flag}"
         return NextStep("Next: find out what is wrong with the input.", step)
+    if grade is Grade.DO_NOT_USE:
+        matches = shlex.quote(_from_here(inputs.database)) if inputs.database else "{images}"
+        text = "Next: make a model from the matches alone, without the poses of the input."
+        return NextStep(text, f"sfm-shapefit map {matches} mapped")
     looked = ", once you have looked" if grade is Grade.LOOK else ""
     text = f"Next: undistort the images for splatting or dense reconstruction{looked}."
     return NextStep(text, "sfm-shapefit workspace {out} {images} {out_dense}")
@@ -341,6 +344,7 @@ class CheckedFacts(FactsOfModel):
     """What `sfm-shapefit check --json` prints: a model that was judged as it stands, not placed."""
 
     examined: Annotated[Literal[True], "Its positions were looked at as they stand."] = True
+    options: Annotated[dict[str, Any], "Options of `locate` or `map` that made it; none of another model."]
     median_track_length: Annotated[
         float | None, "Median number of images that see a 3D point; null if there are none."
     ]
@@ -348,6 +352,11 @@ class CheckedFacts(FactsOfModel):
     scale_bars: Annotated[tuple[ScaleBar, ...], "Known lengths between points, and those in the model."] = ()
     second_opinion: Annotated[str | None, "Folder that has the models of the second opinion, if any."] = None
     images: Annotated[str | None, "Folder of the pictures that were matched for this, if any."] = None
+
+    @property
+    def has_matches(self) -> bool:
+        """Whether it was compared with matches of a database or of its pictures, and not its tracks alone."""
+        return bool(self.inputs.database or self.images)
 
     @property
     def next_step(self) -> NextStep:
@@ -377,10 +386,16 @@ class CheckedFacts(FactsOfModel):
             text = "Next: check it against the database that it was made from."
             return NextStep(text, f"sfm-shapefit check {path} --database ITS_DATABASE")
         text = "Next: place the cameras anew from their rotations and matches, and compare."
-        return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
+        step = f"locate {path} located"
+        if self.options:  # `locate` and `map` would make the same again
+            text, step = "Next: see which of its pairs contradict one another.", f"inspect {path}"
+        return NextStep(text, f"sfm-shapefit {step}{self.inputs.database_flag}")
 
     def _next_of_evidence(self, path: str) -> NextStep:
         """Return how to get more evidence: from photographs, or from all pairs of them if asked."""
+        if self.inputs.database:
+            text = "Next: make a model of all images of the database."
+            return NextStep(text, f"sfm-shapefit map {shlex.quote(_from_here(self.inputs.database))} mapped")
         if self.images:
             text = "Next: match all its photographs, and place them anew."
             return NextStep(text, "sfm-shapefit map {images} mapped")
@@ -398,11 +413,11 @@ class CheckedFacts(FactsOfModel):
 
     def _next_of_lenses(self, path: str) -> NextStep:
         """Return what to do about lenses that cannot be: one per device is known better."""
-        if self.num_lenses == 1:
+        if self.num_lenses == 1 and self.options.get("intrinsics") != "all":
             text = "Next: calibrate the lens, or let it change where the cameras are placed anew."
             command = f"sfm-shapefit locate {path} located --intrinsics all{self.inputs.database_flag}"
             return NextStep(text, command)
-        text = "Next: give all images of a device one lens, and reconstruct them again."
+        text = "Next: give all images of a device one lens of few parameters, and reconstruct them again."
         return NextStep(text, "sfm-shapefit map {images} mapped")
 
     def told(self, cameras: Table[CameraRow], pairs: Table[PairRow]) -> Telling:
@@ -423,6 +438,7 @@ class CheckedFacts(FactsOfModel):
 class JoinedFacts(CheckedFacts):
     """locate.json of joined models, those of `map` in joined_0: looked at, not placed anew."""
 
+    options: Options
     models: Annotated[list[str], "The folders of the models in it."]
     joins: Annotated[list[JoinFacts], "How they were joined."]
     scale_sigma: Annotated[float | None, "Relative standard deviation of the scale; null if not known."]

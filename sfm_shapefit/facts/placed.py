@@ -118,7 +118,7 @@ class KeyFigures(Record):
         """Say how uncertain a position is; `sigma_of` as of `Facts`."""
         share = self.sigma_of_extent
         if self.sigma is None or share is None or share > 1.0:
-            return "how well positions are known is not known"
+            return "the uncertainty of positions is not known"
         is_metric = self.sigma_unit not in (UNITS["input"], UNITS["unit"], SOLVER_UNITS)
         measured = f" ({self.sigma:.2g} {self.sigma_unit})" if is_metric else ""
         return f"positions known to ± {100.0 * share:.2g} % of the scene{measured}{scope_of(sigma_of)}"
@@ -148,10 +148,9 @@ class Piece(Record):
     @property
     def statement(self) -> str:
         """Where it stands, in words."""
-        return (
-            f"{self.folder}: {self.num_placed} of {counted(self.num_cameras, 'camera')}, hinged at "
-            f"{', '.join(self.hinges) or 'nothing'}, with a scale of its own"
-        )
+        hinged = f", hinged at {', '.join(self.hinges)}" if self.hinges else ""
+        cameras = f"{self.num_placed} of {counted(self.num_cameras, 'camera')}"
+        return f"{self.folder}: {cameras}{hinged}, with a scale of its own"
 
 
 def folder_of(piece: int) -> str:

@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TextIO, TypeVar, cast, get_args, overload
@@ -232,6 +233,13 @@ def model_scale_sigma(model: Any) -> float | None:
     """Return the relative standard deviation of the scale of a result or model, likewise."""
     sigma: float | None = told_of(model, "scale_sigma", float)
     return sigma
+
+
+def model_options(model: Any) -> dict[str, Any]:
+    """Return the options with which a result or model was made, likewise; none of another program's."""
+    with suppress(InputError):  # which may have a locate.json of its own
+        return told_of(model, "options", dict) or {}
+    return {}
 
 
 def told_of(model: Any, name: str, read: Callable[[Any], Any]) -> Any:

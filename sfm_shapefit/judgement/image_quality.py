@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct_pairs
+from sfm_shapefit.base.wording import in_pixels
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_each
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.points import Points
@@ -79,5 +80,7 @@ def find_weak_images(images: Images, quality: ImageQuality) -> Iterator[Reason]:
             yield from of_each(Kind.POINTS, images.names[k : k + 1], f"it sees {seen} 3D points")
         if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual_px):
             error_px = quality.errors_px[k]
-            clause = f"its reprojection error is {error_px:.1f} px, where {usual_px:.1f} px is usual"
+            clause = (
+                f"its reprojection error is {in_pixels(error_px, 1)}, where {in_pixels(usual_px, 1)} is usual"
+            )
             yield from of_each(Kind.POINTS, images.names[k : k + 1], clause)

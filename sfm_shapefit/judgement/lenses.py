@@ -157,7 +157,7 @@ def find_odd_lenses(
     faults.pop(("", False), None)
     for (fault, cannot_be), lenses in faults.items():
         cameras = posed[np.isin(images.lens_of[posed], lenses)]
-        kind = "a lens that cannot be" if cannot_be else "an unusual lens"
+        kind = "an impossible lens" if cannot_be else "an unusual lens"
         sentence = f"{kind}: focal length {{}} picture widths, with {fault}"
         names, own = images.names_of(cameras), widths[images.lens_of[cameras]]
         yield OddImages.of_values(Kind.LENS, names, own, sentence, cannot_be=cannot_be)

@@ -66,6 +66,7 @@ _MOST_WEIGHT = 200.0  # matches of a pair that count for its vote; hundreds are 
 _FLOOR_RAD = np.radians(0.1)  # radians; added for the errors of the given rotations
 _LEAST_TURN_RAD = np.radians(KNOWN_DEG)  # radians; a turn below this and ...
 _AGREEING_SIGMAS = 3.5  # ... below this, in standard deviations of the least certain axis: counts as none
+_FAR = 6.0  # standard deviations about each axis; of a billion rotations, hardly one is off by more by chance
 _LARGEST_SIGMA_RAD = np.radians(ALIKE_DEG)  # radians; agreement says nothing where more is as likely
 _LEVEL_QUANTILE, _NORMAL_QUANTILE = 0.25, 1.1  # quantile of errors, and its value for normal ones; see above
 _UNEXPLAINED, _EXPLAINED = (
@@ -126,6 +127,18 @@ class Doubts:
     def members(self, camera: int) -> IntArray:
         """Return the cameras of a camera's body, ascending."""
         return np.flatnonzero(self.bodies == self.bodies[camera])
+
+    @property
+    def ambiguous(self) -> BoolArray:
+        """(n,) cameras whose pairs speak for two rotations."""
+        return np.array([kind is Doubt.AMBIGUOUS for kind in self.kinds], dtype=np.bool_)
+
+    def known_to(self, sigma_rad: float) -> "Doubts":
+        """Return the same where rotations are known to that standard deviation about each axis.
+
+        Where pairs speak for two rotations, the given one is right if the other is far beyond that.
+        """
+        return self.without(self.ambiguous & (np.radians(self.angles_deg) > _FAR * sigma_rad))
 
     def without_repetition(self) -> "Doubts":
         """Return the same where the scene cannot repeat itself: what is ambiguous is not known."""

@@ -18,7 +18,7 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import SMALLEST_SHAPE
 from sfm_shapefit.judgement.trust import CameraTrust, judge_cameras
-from sfm_shapefit.judgement.turns import Doubt, Doubts
+from sfm_shapefit.judgement.turns import Doubts
 from sfm_shapefit.judgement.uncertainty import (
     GroupGauge,
     propagate,
@@ -75,8 +75,7 @@ class Assessment(CameraTrust):
     @property
     def ambiguous(self) -> BoolArray:
         """(k,) cameras that another rotation rivals by their matches, and which no pixels confirm."""
-        kinds = [None] * len(self.trust) if self.doubts is None else self.doubts.kinds
-        return np.array([kind is Doubt.AMBIGUOUS for kind in kinds], dtype=np.bool_)
+        return np.zeros(len(self.trust), dtype=np.bool_) if self.doubts is None else self.doubts.ambiguous
 
     @property
     def sigmas(self) -> FloatArray:

@@ -110,11 +110,13 @@ def doubt_cameras(
     relative: RelativeRotations | None,
     images: Images,
     confirmed: BoolArray | None = None,
+    sigma_rad: float = np.inf,
 ) -> Judged:
     """Return the placement with a trust that follows what the pairs say of the rotations.
 
     What `ask_pairs` returned is `relative`; if None, the given rotations are believed. Pairs of a model's own
-    tracks hold no second scene, and say nothing of `confirmed` cameras (k,); None: pairs of a database.
+    tracks hold no second scene, and say nothing of `confirmed` cameras (k,); None: pairs of a database. The
+    given rotations are known to `sigma_rad` about each axis.
     """
     if relative is None:
         return replace(placement, assessment=believe_rotations(placement.assessment))
@@ -130,6 +132,7 @@ def doubt_cameras(
     guesses = np.array([_is_guess(lens) for lens in images.lenses])[images.lens_of[placement.cameras]]
     doubts = replace(find_turned(pairs, labels), guessed=guesses)
     doubts = doubts if confirmed is None else doubts.without(confirmed).without_repetition()
+    doubts = doubts.known_to(sigma_rad)
     return replace(placement, assessment=weigh_doubts(placement.assessment, doubts))
 
 

@@ -76,7 +76,7 @@ def locate_components(
         try:
             located = _locate_component(run, members, averaging, relative)
         except UnsolvableError as error:
-            reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
+            reasons |= dict.fromkeys(frames.tolist(), str(error))
             continue
         names = run.images.names_of(members)
         inside = frozenset(names)

@@ -28,7 +28,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.check_result import CheckResult, OtherModel, checked_camera_rows, checked_pair_rows
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.tables import contradicting
+from sfm_shapefit.facts.tables import contradicting, model_options
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import structure_of
 from sfm_shapefit.judgement.check_reasons import CheckedModel, of_alike_pictures, reasons_against
@@ -185,7 +185,7 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
     facts = CheckedFacts(
         inputs=source.inputs.facts,
         images=str(source.inputs.images) if source.inputs.images else None,
-        options={},
+        options=model_options(source.inputs.folder),
         verdict=state.verdict,
         num_images=len(cameras),
         num_placed=state.images.num_images,

@@ -137,7 +137,9 @@ def judge_piece(state: ModelState, clock: Clock) -> ModelState:
             judged = replace(judged, second_configuration=None)
         judged = _with_known_errors(judged, state).without_error_samples()
         fitting = None if source.has_database else fit[judged.cameras]
-        return _choose(state, doubt_cameras(judged, state.directions, relative, source.images, fitting))
+        sigma_rad = state.inputs.rough_rad or state.inputs.pull_rad or np.inf
+        doubted = doubt_cameras(judged, state.directions, relative, source.images, fitting, sigma_rad)
+        return _choose(state, doubted)
 
 
 def _with_known_errors(judged: Judged, state: ModelState) -> Judged:

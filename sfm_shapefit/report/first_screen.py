@@ -6,7 +6,7 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
-from sfm_shapefit.base.wording import counted, first_of, rounded
+from sfm_shapefit.base.wording import counted, first_of, in_pixels, rounded
 from sfm_shapefit.facts.model import CheckedFacts, FactsOfModel, JoinedFacts, ModelFacts
 from sfm_shapefit.facts.placed import IN_MEMORY, Facts, GraphFacts, scope_of
 from sfm_shapefit.judgement.reasons import Grade, Kind
@@ -165,7 +165,7 @@ def _points_tile(drawing: Drawing, facts: Facts) -> Iterator[dict[str, str]]:
         return
     label, hint = "3D points", "Triangulated from the placed cameras."
     if facts.mean_reprojection_error_px is not None:
-        label += f", {facts.mean_reprojection_error_px:.2f} px mean reprojection error"
+        label += f", {in_pixels(facts.mean_reprojection_error_px, 2)} mean reprojection error"
     if isinstance(facts, ModelFacts) and facts.agreement.observations is not None:
         hint += f" {facts.agreement.observations:.0%} of the matched keypoints see one."
     yield _tile(f"{drawing.points.num_all:,}", label, hint)

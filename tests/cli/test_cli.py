@@ -17,6 +17,7 @@ import sfm_shapefit
 from sfm_shapefit.base import atomic_folder as output
 from sfm_shapefit.base.settings import setting_groups
 from sfm_shapefit.cli import app
+from sfm_shapefit.cli.colmap_names import answer_for_command
 from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.facts.command_options import LocateOptions
 from sfm_shapefit.facts.placed import UNITS
@@ -74,7 +75,7 @@ def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
     assert told.lines[2] == "positions known to ± 12 % of the scene"
     assert told.lines[0].startswith("8 of 8 images placed, ")
     lost = replace(facts, figures=replace(facts.figures, sigma_of_extent=1.5))
-    assert lost.told((), "").lines[2] == "how well positions are known is not known"
+    assert lost.told((), "").lines[2] == "the uncertainty of positions is not known"
     metric = replace(facts, figures=replace(facts.figures, sigma_unit=UNITS["prior"]))
     assert metric.told((), "").lines[2].endswith("12 % of the scene (0.5 of the priors' units)")
     assert figures.sigma == pytest.approx(np.median(drawing.cameras.sigmas[drawing.cameras.placed]))
@@ -108,6 +109,11 @@ def test_other_commands_take_colmaps_names_of_paths_too(tmp_path):
     [
         ("mapper --database_path a", "mapper is COLMAP's; here it is sfm-shapefit map DATABASE OUT"),
         ("model_comparer --input_path1 a", "here it is sfm-shapefit evaluate MODEL REF"),
+        ("colmap mapper --database_path a", "mapper is COLMAP's; here it is sfm-shapefit map DATABASE OUT"),
+        ("glomap --help", "glomap is another program; `sfm-shapefit --help` lists the commands"),
+        ("stereo_fusion a", "no counterpart here; run it on the folder of sfm-shapefit workspace MODEL"),
+        ("matches_importer a", "no counterpart here; run it on the database before sfm-shapefit map"),
+        ("model_cropper a", "no counterpart here; run it on a model that map or locate wrote"),
         ("map a b --Mapper.ba_refine_focal_length 0", "here it is --intrinsics held, focal or all"),
         ("map a b --GlobalMapper.min_num_matches=30", "here it is min_matches = ... in the file of --config"),
         ("map a b --SiftExtraction.max_num_features 9", "here it is --max-num-features"),
@@ -318,6 +324,54 @@ def test_what_is_wrong_in_a_config_file_is_said_with_its_name_and_tables_are_kno
     config.write_text("min_trust = 0.5")
     said = run("locate", RING_MODEL, tmp_path / "out", *flags, "--min-trust", "7", code=2).stderr
     assert "options.toml: " not in said
+
+
+COMMANDS_OF_COLMAP = """
+    gui automatic_reconstructor bundle_adjuster color_extractor database_cleaner database_creator
+    database_merger advancing_front_mesher delaunay_mesher exhaustive_matcher feature_extractor
+    feature_importer geometric_verifier global_mapper guided_geometric_verifier hierarchical_mapper
+    image_deleter image_filterer image_rectifier image_registrator image_undistorter
+    image_undistorter_standalone mapper matches_importer mesh_simplifier mesh_texturer model_aligner
+    model_analyzer model_clusterer model_comparer model_converter model_cropper model_merger
+    model_orientation_aligner model_splitter model_transformer patch_match_stereo point_filtering
+    point_triangulator pose_prior_mapper poisson_mesher project_generator rig_configurator
+    rotation_averager sequential_matcher spatial_matcher stereo_fusion transitive_matcher
+    view_graph_calibrator vocab_tree_builder vocab_tree_matcher vocab_tree_retriever help version
+"""
+
+
+def test_each_command_of_colmap_is_answered_with_commands_that_there_are():
+    ours = {*get_command(app).commands}
+    for name in COMMANDS_OF_COLMAP.split():
+        answer = answer_for_command(name)
+        assert answer, name
+        assert set(re.findall(r"sfm-shapefit ([a-z]+)", answer)) <= ours
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "database_path=a.db\nlog_level=0\n[Mapper]\nmin_num_matches=15\nba_refine_focal_length=true\n"
+            "ba_local_max_refinements=2",
+            "has options of COLMAP, which are not read: log_level is --quiet or --verbose here; "
+            "Mapper.min_num_matches is min_matches = ... here; Mapper.ba_refine_focal_length is --intrinsics "
+            "held, focal or all here; paths are arguments here; 1 option can be left out",
+        ),
+        (
+            "[Mapper]\nnum_threads = 4\nfoo = 1",
+            "Mapper.num_threads is --threads here; 1 option can be left out",
+        ),
+        ("min_num_matches = 15", "min_num_matches is min_matches = ... here"),
+        ("[mapper]\na = 1", "'mapper' is no option"),
+        ("# A page\nof words", "is not a readable TOML file"),
+    ],
+)
+def test_a_file_of_colmaps_options_is_answered_with_what_these_are_here(tmp_path, text, words):
+    (tmp_path / "project.ini").write_text(text)
+    config = ("--config", tmp_path / "project.ini")
+    said = run("map", RING / "database.db", tmp_path / "out", *config, code=2).stderr
+    assert words in " ".join(said.split())
 
 
 def test_a_config_file_sets_options_and_flags_win(tmp_path):

@@ -1,7 +1,9 @@
 """`check MODEL`: the verdict on any COLMAP model as it stands, which is left as it is."""
 
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -191,6 +193,10 @@ def test_a_model_that_nothing_speaks_for_does_not_pass_strict(tmp_path):
     alone = spoiled(tmp_path / "alone", points=False)
     judged = run("check", alone, "--strict", code=4).stdout
     assert "verdict: cannot be judged: it has no 3D points, and no database was given or found" in judged
+    tracks = run("check", shutil.copytree(model, tmp_path / "tracks"), "--strict", code=4)
+    assert tracks.stdout.splitlines()[2] == "verdict: good"
+    assert "by its own tracks alone, which cannot show a fold" in " ".join(tracks.stderr.split())
+    run("check", model, "--strict", "--no-second-opinion", "-q", code=0)
     strangers = spoiled(tmp_path / "strangers", names="other-{}".format)
     database = ("--database", RING / "database.db")
     assert "has 0 of the model's 8 images" in run_refused("check", strangers, *database)
@@ -305,6 +311,52 @@ def test_images_without_a_pose_are_no_cameras_to_look_at():
 def test_lenses_that_cannot_be_ask_for_one_lens_per_device_and_a_single_one_for_its_calibration():
     facts = check(RING / "sparse/0", second_opinion=False).facts
     odd = ModelVerdict.weigh([Reason(kind=Kind.LENS, sentence="a lens is 42 widths long")])
-    for num_lenses, advice in ((8, "sfm-shapefit map IMAGES"), (1, "--intrinsics all")):
-        step = replace(facts, verdict=odd, num_lenses=num_lenses).next_step
+    anew, freed = "sfm-shapefit map IMAGES", {"intrinsics": "all"}
+    for num_lenses, made, advice in ((8, {}, anew), (1, {}, "--intrinsics all"), (1, freed, anew)):
+        step = replace(facts, verdict=odd, num_lenses=num_lenses, options=made).next_step
         assert advice in step.command
+
+
+@pytest.fixture
+def models_in_a_folder(tmp_path, monkeypatch):
+    """Go to a folder with a sound model, one with two poses, one with wrong poses, and their database."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(RING / "sparse" / "0", "sound")
+    shutil.copyfile(RING / "database.db", "ring.db")
+    spoiled(Path("two"), num_posed=2)
+    turned, rng = pycolmap.Reconstruction("sound"), np.random.default_rng(0)
+    for frame in turned.frames.values():
+        turn = pycolmap.Rotation3d(rng.normal(size=3))
+        frame.rig_from_world = pycolmap.Rigid3d(turn * frame.rig_from_world.rotation, rng.normal(size=3))
+    Path("turned").mkdir()
+    turned.write("turned")
+
+
+@pytest.mark.parametrize(
+    "begin",
+    [
+        "check turned --database ring.db",
+        "check turned",
+        "check two --database ring.db",
+        "locate turned out --database ring.db",
+        "locate turned out",
+        "inspect turned --database ring.db",
+        "evaluate sound sound",
+        "evaluate sound",
+        "convert sound copy",
+    ],
+)
+@pytest.mark.usefixtures("models_in_a_folder")
+def test_no_next_step_leads_back_to_a_command_that_was_run(begin):
+    """Followed to its end: what needs something that only the user has, or a workspace."""
+    done, words = set(), begin.split()
+    while not {"IMAGES", "ITS_DATABASE", "FILE", "DISTANCE", "workspace"} & {*words}:
+        assert tuple(words) not in done
+        done.add(tuple(words))
+        result = run(*words)
+        assert result.exit_code in (0, 4), result.output
+        if result.exit_code == 4:
+            break
+        last = result.stdout.splitlines()[-1]
+        assert last.startswith("next: sfm-shapefit ")
+        words = last.removeprefix("next: sfm-shapefit ").split()

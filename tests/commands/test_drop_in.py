@@ -50,9 +50,40 @@ def test_lenses_that_pycolmap_is_to_keep_are_kept_and_options_without_counterpar
     models.append(sfm_shapefit.global_mapping(guessed, "", tmp_path / "global", globally))
     with pytest.warns(UserWarning, match=r"have no effect: multiple_models=False; docs/coming_from"):
         models.append(sfm_shapefit.global_mapping(guessed, "", tmp_path / "grown", grown, input_path=""))
+    fixed = pycolmap.IncrementalPipelineOptions(constant_cameras={camera.camera_id}, constant_rigs={1})
+    models.append(sfm_shapefit.global_mapping(guessed, "", tmp_path / "fixed", fixed))
+    fixed.constant_cameras = {camera.camera_id + 1}
+    with pytest.raises(InputError, match="lacks 1 camera of the database, such as"):
+        sfm_shapefit.global_mapping(guessed, "", tmp_path / "fixed", fixed)
     free, *held = [next(iter(model[0].cameras.values())).focal_length_x for model in models]
-    assert held == [focal, focal]
+    assert held == [focal, focal, focal]
     assert abs(free - focal) > 0.01 * focal
+
+
+def test_priors_and_gravity_of_the_database_are_taken_where_pycolmap_is_to_take_them(tmp_path):
+    measured = tmp_path / "database.db"
+    shutil.copyfile(RING / "database.db", measured)
+    truth = pycolmap.Reconstruction(RING / "sparse/0")
+    with pycolmap.Database.open(measured) as database:
+        for image in database.read_all_images():
+            known = truth.find_image_with_name(image.name)
+            down = known.cam_from_world().rotation.matrix() @ [0.0, 0.0, -1.0]
+            prior = pycolmap.PosePrior(position=2.0 * known.projection_center(), gravity=down)
+            prior.coordinate_system, prior.corr_data_id = (
+                pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+                image.data_id,
+            )
+            database.write_pose_prior(prior)
+    placed, upright = pycolmap.IncrementalPipelineOptions(), pycolmap.GlobalPipelineOptions()
+    placed.use_prior_position = upright.mapper.rotation_averaging.use_gravity = True
+    model = sfm_shapefit.global_mapping(measured, "", tmp_path / "placed", placed)[0]
+    for image in model.images.values():
+        known = 2.0 * truth.find_image_with_name(image.name).projection_center()
+        np.testing.assert_allclose(image.projection_center(), known, atol=1e-3)
+    model = sfm_shapefit.global_mapping(measured, "", tmp_path / "upright", upright)[0]
+    for image in model.images.values():
+        up = truth.find_image_with_name(image.name).cam_from_world().rotation.matrix()[:, 2]
+        np.testing.assert_allclose(image.cam_from_world().rotation.matrix()[:, 2], up, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -228,6 +228,16 @@ def test_a_file_that_cannot_serve_is_refused_by_its_line(ring, tmp_path, lines, 
     assert str(refused.value).startswith(str(path))
 
 
+def test_bars_and_ends_with_blanks_are_told_apart(ring, tmp_path):
+    views = (("0001.jpg", 100), ("0002.jpg", 110))
+    ends = (("a", "b c"), ("a", "d"), ("a b", "c"), ("a b", "d"))
+    rows = ["\t".join(("2", "0.001", str(x), "100", image, *end)) for end in ends for image, x in views]
+    (tmp_path / "bars.txt").write_text("\n".join(rows))
+    known = read_scale_bars(tmp_path / "bars.txt", read_model(ring).images)
+    assert known.bars == ("a", "a b")
+    assert known.points.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
 def test_bars_that_make_a_model_one_point_are_refused(ring, tmp_path):
     short = [" ".join(("1e-13", "1e-16", *one.split()[2:])) for one in lines_of(ring)]
     with pytest.raises(InputError, match=r"bars make the model .*e-1. times as large, so small that its cam"):
@@ -243,7 +253,7 @@ def test_lengths_that_are_none_are_told(ring):
     found = sfm_shapefit.evaluate_lengths(few, [("0001.jpg", "0002.jpg")])
     assert found.lengths == []
     assert found.warnings[-1].startswith(
-        "how well the distance of 0001.jpg and 0002.jpg is known is not known"
+        "nothing is known of the error of the distance of 0001.jpg and 0002.jpg"
     )
 
 

@@ -313,9 +313,18 @@ def test_pictures_that_are_missing_or_broken_are_named_and_left_out(tmp_path):
     said = done.stdout + done.stderr
     assert done.exit_code == 0, said
     assert "warning: 1 image is left out (no picture): 0.png" in said
+    assert said.splitlines()[-1].startswith("next: ")
     assert "warning: 1 image is left out (unreadable picture): 1.png" in said
     names = {image.name for image in pycolmap.Reconstruction(tmp_path / "out/sparse/0").images.values()}
     assert names == {path.name for path in (tmp_path / "out/images").iterdir()} == {"2.png", "3.png"}
+
+
+def test_a_broken_picture_prints_no_lines_of_the_library_that_reads_it(tmp_path, capfd):
+    sky = draw_sky(tmp_path, ["pinhole"])
+    whole = (sky.images / "1.png").read_bytes()
+    (sky.images / "1.png").write_bytes(whole[: len(whole) // 2])
+    sfm_shapefit.workspace(sky.model, sky.images, tmp_path / "out")
+    assert capfd.readouterr().err == ""
 
 
 def test_a_wrong_folder_or_small_pictures_are_refused_and_nothing_is_written(tmp_path):

@@ -81,7 +81,7 @@ def test_a_warning_that_doubts_a_model_stands_over_no_good_one(ring_located, dou
 def test_an_image_that_is_left_out_is_named_where_it_is_listed_and_in_no_warning(ring_located):
     told = replace(ring_located, kept=np.arange(8) != 3)
     rows = {one.label: list(one.lines) for one in told.told.rows}
-    assert rows["not trusted"] == ["1 image of these; min_trust=0 keeps it"]
+    assert rows["not trusted"] == ["1 image of those above; min_trust=0 keeps it"]
     assert told.verdict.cameras == (told.images.names[3],)
     assert not any(told.images.names[3] in warning for warning in located_warnings(told, ()))
 

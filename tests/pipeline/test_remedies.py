@@ -13,7 +13,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.pipeline.inputs import RunInputs, choose_inputs, open_matches, see_matches
-from sfm_shapefit.pipeline.remedies import find_remedies
+from sfm_shapefit.pipeline.remedies import Remedy, find_remedies
 from tests.judgement.made import place_of
 from tests.pipeline.test_evidence import with_own_lenses
 from tests.scenes import COURTYARD, RING
@@ -49,7 +49,9 @@ def test_map_frees_a_lens_too(truth, tmp_path):
         database.execute("UPDATE frames SET rig_id = 2 WHERE frame_id = 5")
         database.execute("UPDATE frame_data SET sensor_id = 2 WHERE frame_id = 5")
         database.execute("UPDATE images SET camera_id = 2 WHERE image_id = 5")
-    (model,) = sfm_shapefit.map_database(path).models
+    found = sfm_shapefit.map_database(path)
+    (model,) = found.models
+    assert found.timings_s["locate"] > 0.9 * sum(model.timings_s.values())  # which are those of its stages
     assert model.reconstruction.camera(2).mean_focal_length() == pytest.approx(1000.0, rel=0.001)
     assert model.verdict.grade is Grade.GOOD
 
@@ -80,9 +82,29 @@ def test_a_camera_goes_where_twice_as_many_pairs_put_it(ring_located, here, move
         remedies = list(find_remedies(found, inputs_of(found), source))
         assert len(remedies) == moves
         for remedy in remedies:
+            assert not list(find_remedies(found, replace(remedy.inputs, fixed=np.arange(8) == 6), source))
             assert remedy.source.inputs.left_out == {*pairs}
             assert remedy.source.view.num_pairs == source.view.num_pairs - here
             assert remedy.applied(found).warnings[0].startswith(names[2])
+
+
+def test_a_remedy_is_better_if_less_speaks_against_it_no_camera_is_lost_and_lenses_are_known(ring_located):
+    names = ring_located.images.names
+    evidence = ModelEvidence(places=(place_of(names[2], 3),))
+    before, after = replace(ring_located, evidence=evidence), ring_located
+    moved, freed = (Remedy(None, None, rows, ()) for rows in ({}, {0: 0.1}))
+    assert moved.is_better(after, before)
+    assert freed.is_better(after, before)
+    assert not moved.is_better(after, after)
+    assert not moved.is_better(before, after)
+    lost = after.kept.copy()
+    lost[5] = False  # which counts as much as the place that is gone, ...
+    two = replace(before, evidence=ModelEvidence(places=(*evidence.places, *evidence.places)))
+    assert not moved.is_better(replace(after, kept=lost), before)
+    assert not moved.is_better(replace(after, kept=lost), two)  # ... or less than two
+    open_ = replace(after.intrinsics, undetermined=np.ones_like(after.intrinsics.undetermined))
+    assert not freed.is_better(replace(after, intrinsics=open_), before)
+    assert moved.is_better(replace(after, intrinsics=open_), before)
 
 
 def inputs_of(found):

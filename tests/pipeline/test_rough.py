@@ -52,6 +52,14 @@ def test_what_was_wrong_is_told_per_camera(found):
     assert np.isfinite(table["moved"]).all()
 
 
+@pytest.mark.parametrize("sigma_deg", [0.1, 1.0])
+def test_known_rotations_decide_where_houses_look_the_same(sigma_deg):
+    """By the matches alone, two cameras may as well be turned by 90 degrees."""
+    found = sfm_shapefit.locate(PHOTOGRAPHED / "truth", rotations=sigma_deg)
+    assert found.verdict.statement == "good"
+    assert found.warnings == ()
+
+
 @pytest.fixture(scope="module")
 def guessed(tmp_path_factory):
     """The photographs' database with a guessed focal length and no distortion, and what `map` makes of it."""

@@ -146,6 +146,23 @@ def test_begin_takes_rotations_as_they_are_or_makes_averaged_and_rough_ones_fine
     assert np.abs(placed - TRUTH.centers).max() < 1e-6 * np.ptp(TRUTH.centers)
 
 
+def test_a_state_says_who_is_fixed_and_whose_matches_are_read():
+    with opened() as source:
+        state, fixed = state_at(source, 0.1 * TRUTH.centers), np.arange(8) < 2
+        held = ModelState.of(replace(state.inputs, fixed=fixed), source)
+    assert (state.source.fixed, state.among) == (None, None)
+    np.testing.assert_array_equal(held.source.fixed, fixed)
+    second = replace(state.placement, pieces=2 * state.placement.pieces, piece=1)
+    np.testing.assert_array_equal(replace(state, placement=second).among, np.arange(8))
+    assert state.given_poses(np.arange(8)).rotations is None
+    adjusted = replace(state, adjustment=SimpleNamespace()).given_poses(np.arange(2, 5))
+    np.testing.assert_array_equal(adjusted.rotations, state.inputs.images.rotations[2:5])
+    first, last = SimpleNamespace(), SimpleNamespace()
+    assert replace(state, first=first).estimate is first
+    assert replace(state, first=first, adjustment=last).estimate is last
+    assert replace(state, first=first, adjustment=first, bundle=last).estimate is last
+
+
 def test_measured_directions_are_those_of_the_true_cameras():
     with opened() as source:
         state = measure_directions(state_at(source, TRUTH.centers), Clock())
@@ -406,8 +423,9 @@ def test_seed_has_the_scale_the_origin_and_the_axes_that_are_told_also_where_all
         state = state_at(source, 0.1 * TRUTH.centers, options=LocateOptions(adjust=adjust), **told)
         placement = judge(state.placement, PlacementOptions())
         state = replace(state, placement=placement, kept=np.ones(8, np.bool_))
-        found = set_gauge(seed_points(state, Clock()))
+        found = set_gauge(seed_model(state, Clock()))
     assert (found.bundle is not None) == (adjust == "full")
+    assert (found.judged.adjusted_covariances is not None) == (adjust == "full")
     centers = found.images.centers
     again = state.gauge_rule.choose(np.arange(8), centers, None)  # what is told holds already
     assert again.scale == found.gauge.scale

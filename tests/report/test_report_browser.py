@@ -1,11 +1,13 @@
 """The report in a real browser: it opens without complaint, asks the network for nothing, answers clicks."""
 
 import base64
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from sfm_shapefit.report.lens_residuals import LensField
 from sfm_shapefit.report.matched import DrawnMatches
 from sfm_shapefit.report.page import Pictures, write_report
 from tests.browser import chromium, complaints, opened, requests, wait_for
@@ -421,6 +423,26 @@ def test_a_picture_stands_beside_that_of_another_camera_with_the_matches_of_the_
     assert driver.find_element("css selector", "#details h3").text == current.split()[0]
     assert complaints(driver) == []
     assert requests(driver) == []
+
+
+def test_residuals_of_a_lens_are_arrows_with_their_scale_and_what_they_say(driver, tmp_path):
+    drawing, facts = make_drawing()
+    places = np.stack(np.meshgrid([0.25, 0.75], [0.25, 0.75]), axis=-1).reshape(-1, 2)
+    means = np.array([[0.3, 0.0], [0.0, 0.3], [-0.3, 0.0], [0.0, -0.3]])
+    field = LensField("Camera 1, <b>OPENCV</b>", 1.5, places, means, "They point outward.")
+    write_report(replace(drawing, fields=(field,)), facts, tmp_path / "report.html")
+    opened(driver, tmp_path / "report.html")
+    card = driver.find_element("id", "fields-card")
+    assert "Camera 1, <b>OPENCV</b>" in card.text
+    assert "They point outward." in card.text
+    assert "0.2 px" in card.text  # a round length that is no longer than the arrows
+    path = card.find_element("css selector", ".arrows").get_attribute("d")
+    shafts = np.array(re.findall(r"M(\S+) (\S+)l(\S+) (\S+)m", path), dtype=float)
+    bar = card.find_element("css selector", ".scale")
+    per_px = (float(bar.get_attribute("x2")) - float(bar.get_attribute("x1"))) / 0.2
+    np.testing.assert_allclose(shafts[:, 2:], per_px * means, atol=0.1)  # a tenth is the last digit
+    assert (shafts[[1, 2], 0] > shafts[[0, 0], 0]).tolist() == [True, False]
+    assert complaints(driver) == []
 
 
 # Turns the scene for ten frames; returns the calls of WebGL, the largest array that is handed over, and how

@@ -248,7 +248,7 @@ def test_a_warning_leads_to_its_camera_and_is_not_said_of_one_that_is_listed_any
             "do not use",
             None,
             "Do not use this model",
-            "inspect 'a folder/sparse/0' --database 'a folder/d.db'",
+            "map 'a folder/d.db' mapped",
         ),
     ],
 )

@@ -116,8 +116,9 @@ def _faults(images: Images, marks: Sequence[tuple[str, Mark]], index_of: dict[st
     """Yield what is wrong with a mark among all of the list, a clause that begins with its line."""
     seen: set[tuple[str, str]] = set()
     for point, mark in marks:
+        named = point.replace("\t", " ")  # the end of a bar
         if (point, mark.image) in seen:
-            yield f"line {mark.number}: {point} is marked twice in {mark.image}; keep one of its marks"
+            yield f"line {mark.number}: {named} is marked twice in {mark.image}; keep one of its marks"
         seen.add((point, mark.image))
         lens = images.lenses[images.lens_of[index_of[mark.image]]] if mark.image in index_of else None
         if lens is None or not (lens.width and lens.height):
@@ -128,7 +129,7 @@ def _faults(images: Images, marks: Sequence[tuple[str, Mark]], index_of: dict[st
         ):
             at = "({:g}, {:g})".format(*mark.pixel)
             yield (
-                f"line {mark.number}: the mark of {point}, {at}, is outside {mark.image}, a picture of "
+                f"line {mark.number}: the mark of {named}, {at}, is outside {mark.image}, a picture of "
                 f"{lens.width} x {lens.height} pixels; count them from its upper left corner"
             )
 

@@ -23,7 +23,7 @@ from sfm_shapefit.base.paths import refuse_no_folder
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.files.colmap.bitmaps import earth_position, read_bitmap
 from sfm_shapefit.files.colmap.intrinsics import fisheye_guess
-from sfm_shapefit.files.colmap.quiet import quiet_log
+from sfm_shapefit.files.colmap.quiet import quiet_log, quiet_stderr
 from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, name_of
 from sfm_shapefit.files.matching_options import MatchingOptions
 from sfm_shapefit.files.model_folder import model_folders
@@ -102,7 +102,7 @@ class PhotographDatabase:
             )
         missing = [name for name in self.names if name not in known]
         pictures = {}
-        with quiet_log(), ThreadPoolExecutor(self.threads) as pool:
+        with quiet_log(), quiet_stderr(), ThreadPoolExecutor(self.threads) as pool:
             try:
                 for k, picture in enumerate(pool.map(self._read, missing)):
                     pictures[missing[k]] = picture
@@ -217,7 +217,12 @@ class PhotographDatabase:
         process, the locks of this one are gone, and the file is damaged.
         """
         token = pycolmap.CancellationToken()
-        with quiet_log(), ThreadPoolExecutor(1) as pool, pycolmap.Database.open(self.database) as database:
+        with (
+            quiet_log(),
+            quiet_stderr(),
+            ThreadPoolExecutor(1) as pool,
+            pycolmap.Database.open(self.database) as database,
+        ):
             future = pool.submit(call, cancellation_token=token)
             try:
                 while not wait([future], _POLL_S).done:

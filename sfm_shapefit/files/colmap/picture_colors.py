@@ -13,7 +13,7 @@ from sfm_shapefit.base.paths import file_of
 from sfm_shapefit.files.colmap.bitmaps import read_bitmap
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.points import Keypoints, points2d_of, points_of
-from sfm_shapefit.files.colmap.quiet import quiet_log
+from sfm_shapefit.files.colmap.quiet import quiet_log, quiet_stderr
 from sfm_shapefit.files.colmap.reconstructions import arrays_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
@@ -61,7 +61,7 @@ def colors_of_pictures(
         return _sample(picture, xy[points.keypoints[rows]], sizes_px[image])
 
     sums, counts, unread = np.zeros(known.shape), np.zeros(len(known)), []
-    with quiet_log(), ThreadPoolExecutor(pictures.threads) as pool:
+    with quiet_log(), quiet_stderr(), ThreadPoolExecutor(pictures.threads) as pool:
         for (image, _, rows), colors in zip(jobs, pool.map(look, jobs), strict=True):
             if colors is None:
                 unread.append(images.names[image])

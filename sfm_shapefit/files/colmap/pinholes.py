@@ -30,7 +30,7 @@ from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.lenses import lens_of, rays_of
 from sfm_shapefit.files.colmap.picture_colors import Rgb, read_picture
 from sfm_shapefit.files.colmap.points import points2d_of, points_of
-from sfm_shapefit.files.colmap.quiet import quiet_log
+from sfm_shapefit.files.colmap.quiet import quiet_log, quiet_stderr
 from sfm_shapefit.files.colmap.reconstructions import add_point, arrays_of, bytes_of_name, name_of
 from sfm_shapefit.scene.points import Points
 
@@ -276,7 +276,7 @@ def write_flats(flats: Sequence[Flat], out: Path, threads: int, masks: Path | No
                 _write_picture(_black_or_white(seen), out / "masks" / f"{name}{_MASK}")
         return ""
 
-    with quiet_log(), ThreadPoolExecutor(threads) as pool:
+    with quiet_log(), quiet_stderr(), ThreadPoolExecutor(threads) as pool:
         yield from pool.map(write, flats)
 
 

@@ -4,7 +4,7 @@ pycolmap logs through glog, resets its level in some calls, and links Ceres and 
 at all. So two things are silenced, each only as long as a call that needs it:
 
     quiet_log       glog's level             calls that read
-    quiet_stderr    file descriptor 2        view graph calibration
+    quiet_stderr    file descriptor 2        view graph calibration, and calls that read pictures, for libpng
 
 The one switch for all is `hear_pycolmap`; it holds for the code that runs inside it, and not for other
 threads. Errors arrive as exceptions either way.
@@ -15,6 +15,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
 
 import pycolmap
 
@@ -54,8 +55,8 @@ def quiet_log() -> Iterator[None]:
 def quiet_stderr() -> Iterator[None]:
     """Send file descriptor 2 to nowhere while the block runs.
 
-    That holds for the whole process: messages of other threads are lost too, so a progress display must write
-    to a duplicate of descriptor 2.
+    That holds for the whole process: messages of native code in other threads are lost too. What Python
+    writes to `sys.stderr` arrives; a display with a stream of its own needs a duplicate of descriptor 2.
     """
     try:
         saved = None if _heard.get() else os.dup(2)
@@ -64,13 +65,18 @@ def quiet_stderr() -> Iterator[None]:
     if saved is None:
         yield
         return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+    nowhere, before = os.open(os.devnull, os.O_WRONLY), sys.stderr
+    is_own = before is sys.__stderr__  # and nobody's who listens to Python
     try:
         _flush_stderr()
         os.dup2(nowhere, 2)
+        if before is not None and is_own:
+            how: Any = {"buffering": 1, "encoding": before.encoding, "errors": before.errors}
+            sys.stderr = os.fdopen(saved, "w", closefd=False, **how)
         yield
     finally:
         _flush_stderr()
+        sys.stderr = before
         os.dup2(saved, 2)
         os.close(saved)
         os.close(nowhere)

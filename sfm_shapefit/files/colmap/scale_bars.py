@@ -43,8 +43,9 @@ def read_scale_bars(path: Path, images: Images) -> ScaleBars:
     for mark in marks:
         _refuse_contradiction(path, mark, bars.setdefault(mark.names[0], [mark])[0])
         bars[mark.names[0]].append(mark)
-    ends = [f"{name} {end}" for name, own in bars.items() for end in _ends_of(path, name, own[1:])]
-    known, _ = marks_in(path, images, [(" ".join(mark.names[:2]), mark) for mark in marks], ends)
+    # A tab parts bar and end, since both may hold blanks, and neither a tab.
+    ends = [f"{name}\t{end}" for name, own in bars.items() for end in _ends_of(path, name, own[1:])]
+    known, _ = marks_in(path, images, [("\t".join(mark.names[:2]), mark) for mark in marks], ends)
     first = [own[0] for own in bars.values()]
     return ScaleBars(
         names=known.names,
