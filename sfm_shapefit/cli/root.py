@@ -130,7 +130,7 @@ def load_commands(words: Sequence[str] = ()) -> None:
     known = [name for names in _GROUPS.values() for name in names]
     called = next((word for word in words if not word.startswith("-")), None)
     if called in _READING and not {"-h", "--help"}.intersection(words):
-        load_ahead("pycolmap", "_core")  # a tenth of what all imports take, on another core
+        load_ahead("pycolmap")  # a tenth of what all imports take, on another core
     for name in [called] if called in known else known:
         import_module(f"sfm_shapefit.cli.{name.replace('-', '_')}")
 
