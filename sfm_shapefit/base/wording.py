@@ -71,6 +71,14 @@ def rounded(value: float, smallest: float = 1e-9, digits: int = 4) -> str:
     return "0" if abs(value) < smallest else f"{value:.{digits}g}"
 
 
+def in_unit(length: float, unit: str, digits: int = 3) -> str:
+    """Return a length with its unit, of meters in the one that suits it."""
+    if unit != "m":
+        return f"{length:.{digits}g} {unit}".rstrip()
+    factor, unit = next((x for x in ((1e3, "mm"), (1e2, "cm")) if abs(length) * x[0] < 100.0), (1.0, "m"))
+    return f"{rounded(factor * length, digits=digits)} {unit}"
+
+
 def in_pixels(error_px: float, digits: int) -> str:
     """Return an error with so many decimals and its unit; points beside or behind a camera have huge ones."""
     return f"{error_px:.{digits}f} px" if error_px <= _MOST_PX else f"above {_MOST_PX:,} px"

@@ -76,7 +76,7 @@ def map_command(
         from sfm_shapefit.pipeline.execution import open_client
 
         if made is not None:
-            _match(source, made, given, run)
+            _match(source, made, given, run, priors)
         with open_client(scheduler) as client:
             found = map_database(
                 made or source, run.options, progress=run.progress, priors=priors, client=client
@@ -98,11 +98,16 @@ def _database_to_make(source: Path, target: Path, given: dict[str, Any]) -> Path
     return None
 
 
-def _match(images: Path, database: Path, given: dict[str, Any], run: Run[MapOptions]) -> None:
-    """Make the database, and let the report have the images."""
-    from sfm_shapefit.commands.match import match_images
+def _match(
+    images: Path, database: Path, given: dict[str, Any], run: Run[MapOptions], priors: Path | None
+) -> None:
+    """Make the database, unless the run could not use a file, and let the report have the images."""
+    from sfm_shapefit.base.clock import Clock
+    from sfm_shapefit.commands.map import refuse_useless_files
+    from sfm_shapefit.commands.match import begin_database, match_begun
 
-    matching = read_options(MatchingOptions, given)
-    threads = run.options.placement.solver.threads
-    match_images(images, database, options=matching, threads=threads, progress=run.progress)
+    clock = Clock.of(run.progress, run.options.placement.solver.threads)
+    begun = begin_database(images, database, read_options(MatchingOptions, given), clock)
+    refuse_useless_files(database, run.options, priors)
+    match_begun(begun, clock)
     run.flags = replace(run.flags, images=run.flags.images or str(images))

@@ -16,11 +16,12 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import MapResult, tell_joins
 from sfm_shapefit.facts.map_warnings import lost_bars, lost_distances, map_warnings
+from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.components import MapContext, start_run
+from sfm_shapefit.pipeline.components import MapContext, read_beside, start_run
 from sfm_shapefit.pipeline.execution import workers_of
 from sfm_shapefit.pipeline.mapping import join_mapped, locate_components, refine_intrinsics
 from sfm_shapefit.rotations.sequences import Loop, Videos
@@ -71,6 +72,16 @@ def map_database(
     clock = Clock.of(progress, options.placement.solver.threads, workers_of(client, path))
     with closing(DatabaseFile(path)) as file:
         return map_opened(file, options, clock, priors)
+
+
+def refuse_useless_files(database: Path, options: MapOptions, priors: Path | str | None) -> None:
+    """Refuse files that `map_database` could not use; the database needs no features for that.
+
+    Raises:
+        InputError: if there is one; the message says what to do.
+    """
+    with closing(DatabaseFile(database)) as file:
+        read_beside(file, read_images(file).images, options, priors)
 
 
 def map_opened(

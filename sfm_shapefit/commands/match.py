@@ -61,7 +61,12 @@ def match_images(
     """
     options = merge_options(options, MatchingOptions, overrides)
     clock = Clock.of(progress, SolverOptions(threads=threads).threads)
-    folder, path = Path(images), Path(database)
+    match_begun(begin_database(Path(images), Path(database), options, clock), clock)
+    return Path(database)
+
+
+def begin_database(folder: Path, path: Path, options: MatchingOptions, clock: Clock) -> PhotographDatabase:
+    """Return the database of a folder's photographs, with images and lenses; errors as `match_images`."""
     refuse_lens(options)
     if options.mask_path:
         refuse_no_folder(Path(options.mask_path), MASKS)
@@ -79,11 +84,15 @@ def match_images(
         path.unlink()
         _record_of(path).unlink()
         raise InputError(f"{folder} has no two images that pycolmap can read; not {first_of(unreadable)}")
+    return made
+
+
+def match_begun(made: PhotographDatabase, clock: Clock) -> None:
+    """Write the features and matches that a database of photographs lacks."""
     with clock("features"):
         made.detect(clock.advance)
     with clock("matches"):
-        _match(made, _pairing_of(names, options), clock)
-    return path
+        _match(made, _pairing_of(made.known_names(), made.options), clock)
 
 
 def _record_of(database: Path) -> Path:

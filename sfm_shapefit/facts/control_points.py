@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted
+from sfm_shapefit.base.wording import counted, in_unit
 from sfm_shapefit.placement.control_points import ControlFit, TriangulatedMarks
 from sfm_shapefit.scene.given import ControlPoints
 
@@ -75,10 +75,11 @@ def control_warnings(
         errors = np.where(there & ~known.is_check & ~fit.fitting, np.linalg.norm(fit.residuals, axis=1), 0.0)
         if errors.any():
             worst, count = int(np.argmax(errors)), int(np.sum(errors > 0.0))
+            off = in_unit(float(errors[worst]), "m" if known.datum else "")
             say, most = ("contradicts", "") if count == 1 else ("contradict", " most")
             yield (
                 f"{counted(count, 'control point')} {say} the others and set{'s' * (count == 1)} nothing: "
-                f"{known.names[worst]}{most}, {errors[worst]:.3g} off; check coordinates and marks"
+                f"{known.names[worst]}{most}, {off} off; check coordinates and marks"
             )
         lost = np.flatnonzero(~there)
         if len(lost):
@@ -96,16 +97,19 @@ def control_warnings(
         )
 
 
-def describe_control_points(rows: Sequence[ControlPoint]) -> str:
-    """Say how far the model is off control points and check points; empty where there are none."""
+def describe_control_points(rows: Sequence[ControlPoint], unit: str) -> str:
+    """Say how far the model is off control points and check points; empty where there are none.
+
+    The unit is "m", or empty where it is not known.
+    """
     parts = []
     for use, noun in (("control", "control point"), ("check", "check point")):
         own = [row for row in rows if row.use == use and row.error is not None]
         if own:
             errors = [row.error or 0.0 for row in own]
             worst = own[int(np.argmax(errors))].name
-            typical = float(np.sqrt(np.mean(np.square(errors))))
-            off = f"off by {typical:.3g} (root mean square), {worst} most, by {max(errors):.3g}"
+            typical = in_unit(float(np.sqrt(np.mean(np.square(errors)))), unit)
+            off = f"off by {typical} (root mean square), {worst} most, by {in_unit(max(errors), unit)}"
             parts.append(f"{counted(len(own), noun)} {off}")
     unused = sum(row.use == "unused" for row in rows)
     if unused:

@@ -18,7 +18,7 @@ from sfm_shapefit.facts.check_result import CheckResult
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.model import JoinedFacts
-from sfm_shapefit.facts.placed import UNITS, KeyFigures
+from sfm_shapefit.facts.placed import KeyFigures, unit_of
 from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.rows import correlations_of, covariances_of
 from sfm_shapefit.facts.scale_bars import compare_bars
@@ -137,7 +137,7 @@ def tell_joined(group: JoinedGroup, told: JoinInputs, checked: CheckResult, gaug
         k: name for one in group.joins for k, name in ((one.number, one.model), (one.to_number, one.to))
     }
     folder = f"joined_{first}" if located else "."
-    seen, measures = checked.facts, (float(np.median(images.focal_lengths_px)), UNITS[gauge.scale])
+    seen, measures = checked.facts, (float(np.median(images.focal_lengths_px)), unit_of(gauge))
     cameras = joined_camera_rows(checked.cameras, group, located)
     bars = told.bars and compare_bars(images, told.bars, None, gauge.scale_sigma)
     facts = JoinedFacts.taken_from(

@@ -16,7 +16,7 @@ from sfm_shapefit.adjustment.place_errors import (
 from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import rounded
+from sfm_shapefit.base.wording import in_unit, rounded
 from sfm_shapefit.facts.scale_bars import ScaleBar
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
@@ -77,10 +77,8 @@ class LengthFacts(Record):
 
     def said(self, half_width: float) -> str:
         """Return half an interval in two digits, of meters in the unit that suits it."""
-        if self.unit != "m":
-            return rounded(half_width, digits=2)
-        factor, unit = next((x for x in ((1e3, "mm"), (1e2, "cm")) if half_width * x[0] < 100.0), (1.0, "m"))
-        return f"{rounded(factor * half_width, digits=2)} {unit}"
+        is_metric = self.unit == "m"
+        return in_unit(half_width, "m", digits=2) if is_metric else rounded(half_width, digits=2)
 
 
 class LengthBetween(Record):

@@ -257,7 +257,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         return [
             Row("intrinsics", describe_intrinsics(self.intrinsics)),
             Row("rigs", describe_rigs(self.refined_rigs)),
-            row("control points", describe_control_points(self.control_points)),
+            row("control points", describe_control_points(self.control_points, "m" if self.datum else "")),
             row("scale bars", describe_scale_bars(self.scale_bars)),
             row("lengths", self.lengths.statement if self.lengths and self.lengths.has_scale else ""),
             row("straight", describe_line(self.line_sigma)),

@@ -19,10 +19,11 @@ from sfm_shapefit.base.arrays import FloatArray, quantile
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.geometry import extent_of, fit_similarity_l1, median_spread
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted, rounded
+from sfm_shapefit.base.wording import counted, in_unit, rounded
 from sfm_shapefit.facts.tables import CameraRow, Table
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.reasons import ModelVerdict
+from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement, count_large
 from sfm_shapefit.placement.right_pairs import TakenForRight
 from sfm_shapefit.refinement.starts import Finish
@@ -39,6 +40,8 @@ UNITS = {
     "scale bars": "of the scale bars' units",
 }
 """Unit of a standard deviation, by the choice of the scale."""
+METERS = "m"
+"""Unit of positions whose origin on Earth is known."""
 SOLVER_UNITS = "of the solver's units"
 NOISE_ONLY = "matching noise only"
 """Beginning of a statement that standard deviations leave out errors of rotations and calibration."""
@@ -89,7 +92,7 @@ class KeyFigures(Record):
             pair_error_deg: median angle between the direction of a pair and the line between its cameras.
             focal_length_px: median over the images, as pairs are of images, and one camera may take most of
                 them; NaN for a bare graph.
-            unit: what positions are given in, one of `UNITS` or `SOLVER_UNITS`.
+            unit: what positions are given in, see `unit_of`, or `SOLVER_UNITS`.
         """
         placed, centers, sigmas = (cameras.columns[name] for name in ("placed", "center", "sigma"))
         centers = centers[placed & np.isfinite(centers).all(axis=1)]
@@ -114,14 +117,34 @@ class KeyFigures(Record):
         in_pixels = "" if self.pair_error_px is None else f" ({self.pair_error_px:.2g} px)"
         return f"{rounded(self.pair_error_deg, digits=2)} deg{in_pixels}"
 
+    @property
+    def unit(self) -> str:
+        """Unit of positions where that is known, else "units"."""
+        return METERS if self.sigma_unit == METERS else "units"
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether something known set the scale of positions."""
+        return self.sigma_unit not in (UNITS["input"], UNITS["unit"], SOLVER_UNITS)
+
     def uncertainty(self, sigma_of: str) -> str:
         """Say how uncertain a position is; `sigma_of` as of `Facts`."""
         share = self.sigma_of_extent
         if self.sigma is None or share is None or share > 1.0:
             return "the uncertainty of positions is not known"
-        is_metric = self.sigma_unit not in (UNITS["input"], UNITS["unit"], SOLVER_UNITS)
-        measured = f" ({self.sigma:.2g} {self.sigma_unit})" if is_metric else ""
+        sigma = in_unit(self.sigma, self.sigma_unit, digits=2)
+        measured = f" ({sigma}, {relation_of(sigma_of)})" if self.has_scale else ""
         return f"positions known to ± {100.0 * share:.2g} % of the scene{measured}{scope_of(sigma_of)}"
+
+
+def unit_of(gauge: Gauge) -> str:
+    """Return what positions in a gauge are given in, to follow a number."""
+    return METERS if gauge.datum else UNITS[gauge.scale]
+
+
+def relation_of(sigma_of: str) -> str:
+    """Say what standard deviations are relative to, in few words."""
+    return f"relative to {'the fixed cameras' if 'fixed cameras' in sigma_of else 'one another'}"
 
 
 def scope_of(sigma_of: str) -> str:

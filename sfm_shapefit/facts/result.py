@@ -29,11 +29,11 @@ from sfm_shapefit.facts.model import (
 from sfm_shapefit.facts.placed import (
     IN_MEMORY,
     SOLVER_UNITS,
-    UNITS,
     Delivered,
     GraphFacts,
     GraphInputs,
     facts_of_placement,
+    unit_of,
 )
 from sfm_shapefit.facts.placed_graph import PlacedGraph
 from sfm_shapefit.facts.rigs import RefinedSensor
@@ -213,7 +213,7 @@ class LocateResult(_Placed):
     loops: tuple[Loop, ...] = ()
     """Loops of the videos among the images, where `map` looked for some."""
     prior_fit: PriorFit | None = None
-    """How well position priors fit the images and the `directions`; None where they do not set the scale."""
+    """How well position priors fit the images and the `directions`; None where they cannot tell."""
     support: Support
     """Images (n,) left out for their points, and which observations agree with the cameras."""
     evidence: ModelEvidence = field(default_factory=ModelEvidence)
@@ -257,7 +257,7 @@ class LocateResult(_Placed):
         """What is told of the model: each figure of locate.json, terminal and report."""
         placement, model, gauge = self.placement, self.model, self.gauge
         solved = [(p.placement.piece, p.gauge.statement, int(np.sum(p.kept))) for p in (self, *self.further)]
-        measures = (float(np.median(self.images.focal_lengths_px)), UNITS[gauge.scale])
+        measures = (float(np.median(self.images.focal_lengths_px)), unit_of(gauge))
         facts = facts_of_placement(placement, self.cameras, solved, measures) | {
             "num_images": len(self.image_names),
             "num_placed": model.num_reg_images(),

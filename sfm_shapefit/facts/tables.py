@@ -64,7 +64,8 @@ class CameraRow:
     """Distance of its center from the given one, in the output's units, after the similarity that brings most
     given centers near; only with rough rotations."""
     prior_off: float = math.nan
-    """Distance of its center from its position prior, in the output's units; only where priors set these."""
+    """Distance of its center from its position prior, in the prior's units; after the similarity that brings
+    most near, where priors do not set origin and axes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

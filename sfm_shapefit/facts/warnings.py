@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.wording import counted_are, first_of
+from sfm_shapefit.base.wording import counted_are, first_of, in_unit
 from sfm_shapefit.judgement.grade import largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import CHANCE_SHARE
@@ -172,8 +172,10 @@ def _least_trusted(placement: Judged, rows: IntArray) -> str:
 def prior_warnings(fit: PriorFit | None, names: Sequence[str]) -> Iterator[str]:
     """Yield which position priors of the images `names` (n,) are wrong, if any are."""
     if fit is not None and len(fit.wrong):
-        wrong = [f"{names[k]} ({fit.off[k]:.3g} off)" for k in fit.wrong.tolist()]
+        unit, units = ("m", "") if fit.is_metric else ("", ", in the priors' units")
+        wrong = [f"{names[k]} ({in_unit(float(fit.off[k]), unit)} off)" for k in fit.wrong.tolist()]
+        usual = in_unit(float(np.nanmedian(fit.off)), unit, digits=2)
         yield (
-            f"{counted_are(len(wrong), 'position prior')} wrong, most likely: {first_of(wrong)}, in the "
-            f"priors' units; half of all are within {np.nanmedian(fit.off):.2g}; see prior_off in cameras.csv"
+            f"{counted_are(len(wrong), 'position prior')} wrong, most likely: {first_of(wrong)}{units}; "
+            f"half of all are within {usual}; see prior_off in cameras.csv"
         )

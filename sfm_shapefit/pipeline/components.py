@@ -40,27 +40,15 @@ def start_run(
     file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | None
 ) -> "MapContext":
     """Read what a run works from: the database, and the files that the options name."""
-    path = file.path
     with clock("read"):
         refuse_no_features(file)
         read = read_images(file)
         images = read.images
-        if options.freedom.rigs == "free" and not images.has_rigs:
-            raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
-        inputs = read_left_out(inputs_from(path), images.names, options.directions.without)
+        options, inputs, known = read_beside(file, images, options, priors)
         matches = DatabaseMatches(file, images.names)
         images, intrinsics = choose_intrinsics(images, matches, options.freedom.intrinsics, inputs.left_out)
-        gauge = between_images(options.gauge, images.names, "the database has no image")
-        known = read_known(
-            images,
-            file,
-            priors,
-            control_points=gauge.control_points,
-            scale_bars=gauge.scale_bars,
-            gravity=options.averaging.gravity,
-        )
     run = MapContext(
-        options=replace(options, gauge=gauge),
+        options=options,
         clock=clock,
         matches=matches,
         read=read,
@@ -71,6 +59,33 @@ def start_run(
     )
     with clock("read"):
         return run.within_limit()
+
+
+def read_beside(
+    file: DatabaseFile, images: Images, options: MapOptions, priors: Path | str | None
+) -> tuple[MapOptions, Inputs, Known]:
+    """Read what the options tell of the images of a database, which needs no features for that.
+
+    Returns:
+        the options with their distances between these images, the inputs with the pairs that are left out,
+        and what is known of the images.
+
+    Raises:
+        InputError: if a file cannot be used, or an option is not for these images.
+    """
+    if options.freedom.rigs == "free" and not images.has_rigs:
+        raise InputError(f"{file.path} has no rig of several cameras to refine; leave out rigs=free")
+    inputs = read_left_out(inputs_from(file.path), images.names, options.directions.without)
+    gauge = between_images(options.gauge, images.names, "the database has no image")
+    known = read_known(
+        images,
+        file,
+        priors,
+        control_points=gauge.control_points,
+        scale_bars=gauge.scale_bars,
+        gravity=options.averaging.gravity,
+    )
+    return replace(options, gauge=gauge), inputs, known
 
 
 class MapContext(NamedTuple):

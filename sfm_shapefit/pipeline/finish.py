@@ -10,7 +10,7 @@ from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, turned_deg
 from sfm_shapefit.facts.lengths import Axes, LengthFacts, length_between
 from sfm_shapefit.facts.located_warnings import located_warnings
-from sfm_shapefit.facts.placed import UNITS
+from sfm_shapefit.facts.placed import unit_of
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
 from sfm_shapefit.facts.warnings import rotation_suspicions, rotation_warnings
@@ -19,7 +19,14 @@ from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.pipeline.gauge_choice import scale_errors
 from sfm_shapefit.pipeline.state import ModelState
-from sfm_shapefit.placement.gauge import ARBITRARY, FEWEST_PRIORS, coincide
+from sfm_shapefit.placement.gauge import (
+    ARBITRARY,
+    FEWEST_CHECKED,
+    FEWEST_PRIORS,
+    UselessPriorsError,
+    coincide,
+    prior_gauge,
+)
 from sfm_shapefit.placement.gauge_rule import SETS_SCALE
 from sfm_shapefit.placement.prior_fit import PriorFit, compare_with_priors
 
@@ -76,14 +83,29 @@ def _resize_sensors(state: ModelState) -> Template:
 
 
 def _compare_with_priors(state: ModelState) -> PriorFit | None:
-    """Return how well position priors fit the delivered images where they set the scale; else None."""
+    """Return how well position priors fit the delivered images; None if they cannot tell.
+
+    Where something else set origin and axes, they are compared after a fit, if enough check one another.
+    """
     priors, pairs, gauge, judged = state.inputs.known.priors, state.directions, state.gauge, state.judged
-    if priors is None or not gauge.has_priors:
+    if priors is None:
         return None
+    centers, scale = state.images.centers, gauge.similarity.scale
     directions = pairs.directions if gauge.axes is None else pairs.directions @ gauge.axes.T
-    sigmas, axis_sigmas = np.full(state.images.num_images, np.nan), standard_deviations(judged.covariances)
-    sigmas[judged.cameras] = gauge.similarity.scale * axis_sigmas.max(axis=1)
-    return compare_with_priors(state.images.centers, sigmas, priors, pairs.pairs, directions)
+    if not gauge.has_priors:
+        posed = np.flatnonzero(np.isfinite(centers).all(axis=1))
+        own = priors.of(posed)
+        if len(own) < FEWEST_CHECKED:
+            return None
+        try:
+            onto = prior_gauge(centers[posed], own)
+        except UselessPriorsError:
+            return None
+        centers, scale = onto.apply(centers), scale * onto.similarity.scale
+        directions = directions if onto.axes is None else directions @ onto.axes.T
+    sigmas, axis_sigmas = np.full(len(centers), np.nan), standard_deviations(judged.covariances)
+    sigmas[judged.cameras] = scale * axis_sigmas.max(axis=1)
+    return compare_with_priors(centers, sigmas, priors, pairs.pairs, directions)
 
 
 def _warnings(result: LocateResult, state: ModelState) -> Iterator[str]:
@@ -124,7 +146,7 @@ def usual_length(state: ModelState) -> LengthFacts | None:
     """Return how well a length between points of a finished model is known; None where it is not known."""
     gauge = state.gauge
     axes = Axes(
-        unit="m" if gauge.datum else UNITS[gauge.scale],
+        unit=unit_of(gauge),
         has_scale=gauge.scale not in ARBITRARY,
         has_up=gauge.datum is not None or state.inputs.known.gravity is not None,
     )

@@ -17,11 +17,13 @@ class PriorFit(NamedTuple):
     """How far cameras are off their priors, and directions of pairs off the priors' baselines."""
 
     off: FloatArray
-    """(n,) distances in the output's units; NaN where a camera is not placed or has no prior."""
+    """(n,) distances in the priors' units; NaN where a camera is not placed or has no prior."""
     wrong: IntArray
     """(k,) cameras that are farther off than the errors of both explain, the farthest first."""
     angles_deg: FloatArray
     """(m,) NaN where one of the cameras has no prior."""
+    is_metric: bool = False
+    """Whether the priors' units are meters, as of positions on Earth."""
 
 
 def compare_with_priors(
@@ -34,7 +36,7 @@ def compare_with_priors(
     than one.
 
     Args:
-        centers: (n, 3) of all cameras in the output; NaN for those that are not in it.
+        centers: (n, 3) of all cameras in the priors' axes; NaN for those that are not in the output.
         sigmas: (n,) standard deviations of the centers, per axis; NaN where unknown, infinite where nothing
             holds a camera.
         priors: priors of the cameras.
@@ -53,4 +55,5 @@ def compare_with_priors(
     errors[rows] = np.fmax(priors.known.sigmas(), least)
     wrong = np.flatnonzero(off > _FAR * np.hypot(errors, np.nan_to_num(sigmas, posinf=np.inf)))
     angles_deg = angle_between_deg(normalized(positions[pairs[:, 0]] - positions[pairs[:, 1]]), directions)
-    return PriorFit(off, wrong[np.argsort(-off[wrong], kind="stable")], angles_deg)
+    wrong = wrong[np.argsort(-off[wrong], kind="stable")]
+    return PriorFit(off, wrong, angles_deg, is_metric=priors.datum is not None)

@@ -6,9 +6,9 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
-from sfm_shapefit.base.wording import counted, first_of, in_pixels, rounded
+from sfm_shapefit.base.wording import counted, first_of, in_pixels, in_unit, rounded
 from sfm_shapefit.facts.model import CheckedFacts, FactsOfModel, JoinedFacts, ModelFacts
-from sfm_shapefit.facts.placed import IN_MEMORY, Facts, GraphFacts, scope_of
+from sfm_shapefit.facts.placed import IN_MEMORY, Facts, GraphFacts, relation_of, scope_of
 from sfm_shapefit.judgement.reasons import Grade, Kind
 from sfm_shapefit.report.drawing import Drawing, PairClass
 from sfm_shapefit.report.sentences import MAX_TEXT, placed_sentence, shorten
@@ -54,7 +54,7 @@ def tiles(drawing: Drawing, facts: Facts) -> list[dict[str, str]]:
         *_points_tile(drawing, facts),
         _doubtful_tile(drawing, facts),
         *_error_tile(facts),
-        *_shift_tile(drawing),
+        *_shift_tile(drawing, facts.figures.unit),
         *_track_tile(facts),
     ]
 
@@ -140,9 +140,10 @@ def _uncertainty_tile(facts: Facts) -> Iterator[dict[str, str]]:
     figures, of = facts.figures, facts.sigma_of
     sigma, share = figures.sigma, figures.sigma_of_extent
     if sigma is not None and share is not None and share <= 1.0:  # beyond, nothing is known of it
-        label = f"typical uncertainty, {100.0 * share:.2g}% of the scene{scope_of(of)}"
+        relation = f", {relation_of(of)}" if figures.has_scale else ""
+        label = f"typical uncertainty, {100.0 * share:.2g}% of the scene{relation}{scope_of(of)}"
         hint = f"Median standard deviation of a position: {sigma:.2g} {figures.sigma_unit} ({of})."
-        yield _tile(f"± {sigma:.2g} units", label, hint)
+        yield _tile(f"± {in_unit(sigma, figures.unit, digits=2)}", label, hint)
 
 
 def _length_tile(facts: Facts) -> Iterator[dict[str, str]]:
@@ -171,14 +172,18 @@ def _points_tile(drawing: Drawing, facts: Facts) -> Iterator[dict[str, str]]:
     yield _tile(f"{drawing.points.num_all:,}", label, hint)
 
 
-def _shift_tile(drawing: Drawing) -> Iterator[dict[str, str]]:
+def _shift_tile(drawing: Drawing, unit: str) -> Iterator[dict[str, str]]:
     shifts = drawing.shifts()
     known = shifts[np.isfinite(shifts)]
     if len(known) and drawing.extent > 0.0:
         median = float(np.median(known))
         share = f"{100.0 * median / drawing.extent:.2g}% of the scene"
         label = f"typical shift from the input's positions ({share})"
-        yield _tile(f"{median:.2g} units", label, "The input's positions place no camera; they may be wrong.")
+        yield _tile(
+            in_unit(median, unit, digits=2),
+            label,
+            "The input's positions place no camera; they may be wrong.",
+        )
 
 
 def _track_tile(facts: Facts) -> Iterator[dict[str, str]]:

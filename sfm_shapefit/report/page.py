@@ -141,6 +141,7 @@ def page_data(
         "expertFacts": [shorten(text, 4 * MAX_TEXT) for text in facts.expert_sentences()],
         "looks": [_look(hint, rank, pairs) for hint in first_looks(drawing, facts)],
         "noun": drawing.noun,
+        "unit": facts.figures.unit,
         "dimension": drawing.dimension,
         "shownAxes": min(drawing.dimension, len(_AXES)),
         "frustum": drawing.frustum_depth,
@@ -155,7 +156,7 @@ def page_data(
             "colors": pack_array(drawing.points.colors, "u1"),
         },
         "reasons": [shorten(text) for text in reasons],
-        "sceneNote": _scene_note(drawing),
+        "sceneNote": _scene_note(drawing, facts.figures.unit),
         "pairsNote": _pairs_note(drawing),
         "pairsWords": _PAIRS_WORDS if np.any(drawing.pairs.support > 0) else "",
         "hasSupport": bool(np.any(drawing.pairs.support > 0)),
@@ -350,10 +351,10 @@ def _look(hint: Hint, rank: IntArray, pairs: IntArray) -> dict[str, Any]:
     }
 
 
-def _scene_note(drawing: Drawing) -> str:
-    notes = [f"Cameras span {drawing.extent:.4g} units."]
+def _scene_note(drawing: Drawing, unit: str) -> str:
+    notes = [f"Cameras span {drawing.extent:.4g} {unit}."]
     if not np.isfinite(drawing.cameras.poses.rotations[drawing.cameras.placed]).any():
-        notes = [f"Nodes span {drawing.extent:.4g} units."]
+        notes = [f"Nodes span {drawing.extent:.4g} {unit}."]
     if drawing.dimension > len(_AXES):
         notes.append(f"The first three of {drawing.dimension} dimensions are drawn.")
     if drawing.points.num_all > len(drawing.points.xyz):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import IntArray
-from sfm_shapefit.base.wording import make_printable
+from sfm_shapefit.base.wording import in_unit, make_printable
 from sfm_shapefit.facts.model import FactsOfModel, ModelFacts
 from sfm_shapefit.facts.placed import Facts
 from sfm_shapefit.judgement.grade import OTHER_PLACE
@@ -140,8 +140,9 @@ def _certainty(drawing: Drawing, facts: Facts) -> Iterator[str]:
     worst = int(np.argmax(np.where(drawing.cameras.placed, np.nan_to_num(drawing.cameras.sigmas), -1.0)))
     covers, _, relative = facts.sigma_of.removeprefix("adjusted: ").partition("; ")
     meaning = f" Uncertainties cover {covers}, {relative}." if covers else ""
-    who, sigma = shorten(drawing.cameras.names[worst]), drawing.cameras.sigmas[worst]
-    yield f"The least certain position is that of {who}: ± {sigma:.2g} units.{shorten(meaning)}"
+    who = shorten(drawing.cameras.names[worst])
+    sigma = in_unit(float(drawing.cameras.sigmas[worst]), facts.figures.unit, digits=2)
+    yield f"The least certain position is that of {who}: ± {sigma}.{shorten(meaning)}"
 
 
 def _relative_lengths(facts: Facts) -> Iterator[str]:

@@ -77,7 +77,15 @@ def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
     lost = replace(facts, figures=replace(facts.figures, sigma_of_extent=1.5))
     assert lost.told((), "").lines[2] == "the uncertainty of positions is not known"
     metric = replace(facts, figures=replace(facts.figures, sigma_unit=UNITS["prior"]))
-    assert metric.told((), "").lines[2].endswith("12 % of the scene (0.5 of the priors' units)")
+    assert metric.told((), "").lines[2].endswith("(0.5 of the priors' units, relative to one another)")
+    metric = replace(facts, figures=replace(facts.figures, sigma_unit="m"))
+    assert metric.told((), "").lines[2].endswith("12 % of the scene (50 cm, relative to one another)")
+    assert {
+        "label": "typical uncertainty, 12% of the scene, relative to one another",
+        "value": "± 50 cm",
+    }.items() <= {
+        k: v for tile in tiles(drawing, metric) for k, v in tile.items() if tile["value"].startswith("± 50")
+    }.items()
     assert figures.sigma == pytest.approx(np.median(drawing.cameras.sigmas[drawing.cameras.placed]))
     assert f"± {100 * figures.sigma_of_extent:.2g} % of the scene" in result.stdout
 

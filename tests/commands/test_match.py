@@ -302,6 +302,29 @@ def test_alike_images_whose_names_have_spaces_are_refused_with_a_way_out(drawn, 
     assert survey(made)["pairs"] == 3
 
 
+@pytest.mark.parametrize(
+    ("option", "text", "why"),
+    [
+        ("--control-points", "local\n1 2\n", "line 2: expected x y z"),
+        ("--scale-bars", "1 2\n", "line 1: expected the length"),
+        ("--gravity", "a.jpg 1 2\n", "line 1: expected the name"),
+        ("--without", "a.jpg\n", "line 1"),
+        ("--priors", "elsewhere.jpg 1 2 3\n", "no position prior of the model's images"),
+        ("--priors", None, "no position prior of the model's images"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_refused_before_features(drawn, tmp_path, option, text, why):
+    _, folder = drawn
+    file = "database" if text is None else tmp_path / "file.txt"
+    if text is not None:
+        file.write_text(text)
+    out = tmp_path / "out"
+    assert why in run_refused("map", folder / "images", out, option, file, code=3)
+    with pycolmap.Database.open(out / "database.db") as opened:
+        assert opened.num_images()
+        assert not opened.num_keypoints()
+
+
 def test_what_holds_no_images_is_refused_and_nothing_is_made(drawn, tmp_path):
     _, folder = drawn
     empty, out = tmp_path / "empty", tmp_path / "out"

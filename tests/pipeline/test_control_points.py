@@ -144,6 +144,26 @@ def test_coordinates_on_earth_become_east_north_and_up_of_their_median(ring, tmp
     np.testing.assert_allclose(apart, CORNERS - CORNERS[0], atol=1e-6)  # a nanometer of UTM's series
 
 
+def test_a_wrong_prior_is_named_though_control_points_set_the_axes_and_meters_are_said(ring, tmp_path):
+    centers = centers_of(ring)
+    wrong = {name: center + 30.0 * (name == "0004.jpg") for name, center in centers.items()}
+    lines = marks_of(ring, CORNERS, in_utm)
+    lines = [line.replace(" P6", " CHK-6") for line in lines]
+    found = sfm_shapefit.locate(
+        ring,
+        RING / "database.db",
+        control_points=written(tmp_path, lines, "WGS84 UTM 32N"),
+        priors=write_priors(tmp_path / "priors.txt", wrong),
+    )
+    (said,) = [warning for warning in found.warnings if "most likely" in warning]
+    assert said.startswith("1 position prior is wrong, most likely: 0004.jpg (52 off), in the priors' units")
+    off = {row.name: row.prior_off for row in found.cameras}
+    assert max(off, key=off.get) == "0004.jpg"
+    assert found.facts.figures.sigma_unit == "m"
+    told = {row.name: row.lines for row in found.told.rows}
+    assert " mm (root mean square), P" in told["control points"][0]
+
+
 def test_points_on_both_sides_of_longitude_180_are_near_their_datum(ring, tmp_path):
     transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     geodetic = np.asarray(transform.enu_to_ellipsoid(CORNERS, -16.8, 180.0, 5.0))

@@ -118,15 +118,15 @@ const rgbOf = (variable) => {
 const agreeing = (k) => `${count(cameras.agreeing[k])} of ${count(cameras.degree[k])} agree`;
 const otherPlace = (k) => {
   const away = number(Math.hypot(...at(cameras.other, k).map((part, c) => part - cameras.center[3 * k + c])));
-  return `${away} units away, by ${counted(cameras.otherCounts[2 * k + 1], "pair")}; ${count(cameras.otherCounts[2 * k])} for where it is`;
+  return `${away} ${data.unit} away, by ${counted(cameras.otherCounts[2 * k + 1], "pair")}; ${count(cameras.otherCounts[2 * k])} for where it is`;
 };
 const cameraFacts = (k) => [
   ["placed", isPlaced(k) ? "" : "no, left out"],
   ["trust", number(cameras.trust[k], 2)],
-  ["uncertainty", isPlaced(k) && number(cameras.sigma[k], 2) ? `± ${number(cameras.sigma[k], 2)} units` : ""],
+  ["uncertainty", isPlaced(k) && number(cameras.sigma[k], 2) ? `± ${number(cameras.sigma[k], 2)} ${data.unit}` : ""],
   ["pairs", cameras.degree[k] ? agreeing(k) : "none"],
   ["typical error", off(cameras.error[k])],
-  ["moved from the input", cameras.shift && number(cameras.shift[k], 2) ? `${number(cameras.shift[k], 2)} units` : ""],
+  ["moved from the input", cameras.shift && number(cameras.shift[k], 2) ? `${number(cameras.shift[k], 2)} ${data.unit}` : ""],
   ...cameras.further.map(({ title, values }) => [title.toLowerCase(), number(values[k])]),
   ["why", reason(cameras.reason[k])],
   ["stands apart", cameras.group[k] < 0 ? "" : `with group ${cameras.group[k] + 1} (colors show it)`],

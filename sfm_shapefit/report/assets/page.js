@@ -96,10 +96,10 @@ const drawControl = () => {
   $("intrinsics-card").hidden = !data.intrinsics.length;
   fill("intrinsics", plainTable(["Camera", "Model", "Images", "Focal length given (px)", "Found (px)", "Change", "Distortion"], data.intrinsics));
   $("control-card").hidden = !data.control.length;
-  fill("control", plainTable(["Name", "Use", "Off by (units)", "Along the axes (units)", "Off by (px)", "Marks"], data.control));
+  fill("control", plainTable(["Name", "Use", `Off by (${data.unit})`, `Along the axes (${data.unit})`, "Off by (px)", "Marks"], data.control));
   $("control-note").textContent = data.notes.control;
   $("bars-card").hidden = !data.bars.length;
-  fill("bars", plainTable(["Name", "Use", "Known (units)", "In the model (units)", "Off by (units)", "(σ)", "Off by (px)", "Marks"], data.bars));
+  fill("bars", plainTable(["Name", "Use", `Known (${data.unit})`, `In the model (${data.unit})`, `Off by (${data.unit})`, "(σ)", "Off by (px)", "Marks"], data.bars));
 };
 const drawLoops = () => {
   $("loops-card").hidden = !data.loops.length;

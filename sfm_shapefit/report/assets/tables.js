@@ -134,12 +134,12 @@ const drawTables = (onChoice) => {
   // Rows arrive worst first: the cameras by trust, the pairs by verdict and residual.
   const isSaid = new Set(data.looks.map(({ camera }) => camera));
   const why = (k) => (isSaid.has(k) ? "" : reason(cameras.reason[k]) || (isPlaced(k) ? "" : "left out"));
-  const shift = cameras.shift ? [aligned("Shift", cameras.shift, 2, "How far it is from where the input has it, in units")] : [];
+  const shift = cameras.shift ? [aligned("Shift", cameras.shift, 2, `How far it is from where the input has it, in ${data.unit}`)] : [];
   return {
     camera: makeTable("cameras", "camera", numCameras, [
       named(capital(data.noun), (k) => cameras.names[k]),
       ...(isKnown(cameras.trust) ? [numeric("Trust", (k) => cameras.trust[k], 2, "1: its matches fit as well as usual; below 0.6 it is left out unless you say otherwise")] : []),
-      ...(isKnown(cameras.sigma) ? [aligned("± units", cameras.sigma.map((value, k) => (isPlaced(k) ? value : NaN)), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units")] : []),
+      ...(isKnown(cameras.sigma) ? [aligned(`± ${data.unit}`, cameras.sigma.map((value, k) => (isPlaced(k) ? value : NaN)), 2, `Uncertainty of its position, relative to the whole model or to fixed cameras: one standard deviation along the worst axis, in ${data.unit}`)] : []),
       numeric("Pair error (°)", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees: large where most of them contradict"),
       {
         title: "Pairs agree", number: true, value: (k) => (cameras.degree[k] ? cameras.agreeing[k] / cameras.degree[k] : NaN),

@@ -229,7 +229,7 @@ const makeScene = (onChoice) => {
       segments: painter.shapes(SEGMENT, { center, u: ends.map((part, k) => part - center[k]) }),
     });
   }
-  addLayer("grid", `Grid of ${number(grid.square)} units`, true, {
+  addLayer("grid", `Grid of ${number(grid.square)} ${data.unit}`, true, {
     variable: "--line", segments: painter.shapes(SEGMENT, grid.columns), alpha: 0.8, isGrid: true,
   });
   const layer = (name) => layers.find((one) => one.name === name);
