@@ -337,13 +337,12 @@ class LocateResult(_Placed):
                 yield of_model(Kind.INPUT, clause)
 
     def _off_lenses(self) -> Iterator[Reason]:
-        """Yield the focal lengths that are farther from the given ones than EXIF data ever are: 3 sigma."""
+        """Yield focal lengths that were known, and changed by more than 3 sigma of those of EXIF data."""
         most = SIGMAS * PARTS["focal_lengths"].sigmas[Origin.EXIF]
         for row in self.intrinsics.rows(self.placed):
-            if row.origin != Origin.GUESS.value and abs(row.change) > most:
-                clause = (
-                    f"{row.statement}, too far to be believed: is its distortion missing, or a pose wrong?"
-                )
+            if row.origin == Origin.CALIBRATION.value and abs(row.change) > most:
+                clause = f"{row.statement}, too far for one that was known"
+                clause = f"{clause}: is its distortion missing, or a pose wrong?"
                 taken = self.placed.is_posed & (self.placed.camera_ids == row.camera)
                 yield of_model(Kind.LENS, clause, images=self.placed.names_of(np.flatnonzero(taken)))
 
