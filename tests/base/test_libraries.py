@@ -8,7 +8,7 @@ import pytest
 PROGRAM = """
 import sys, threading, zlib
 from sfm_shapefit.base.libraries import load_ahead
-load_ahead({package!r}, "_core")
+load_ahead({package!r})
 for thread in threading.enumerate()[1:]:
     thread.join()
 loaded = [line for line in open("/proc/self/maps") if "/pycolmap/_core" in line]

@@ -153,7 +153,7 @@ def pull(placement, priors, **options):
 
 def test_a_camera_that_was_put_back_stays_undetermined_after_priors_pulled_the_others(reset):
     placement, positions = reset
-    pulled, gauge, _ = pull(placement, made_priors(positions, 0.01, np.arange(40)))
+    pulled, gauge, *_ = pull(placement, made_priors(positions, 0.01, np.arange(40)))
     assert "the priors moved cameras by" in gauge.statement
     assert np.isinf(pulled.assessment.sigmas[40]).all()
     assert pulled.assessment.trust[40] == 0.0

@@ -53,7 +53,7 @@ def test_a_fifth_of_wrong_directions_costs_less_than_8_percent(family):
 def test_chains_on_which_shapefit_collapses_are_placed(family):
     problem = CHAINS[family]()
     placement = place(problem.view_graph)
-    finish = placement.refined
+    finish = placement.refined.finish
     assert finish.lud is not None
     assert shape_error(placement.certified.locations, problem.locations) > 0.3
     assert finish.collapsed
