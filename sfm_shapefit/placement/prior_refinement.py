@@ -78,7 +78,7 @@ def pull_to_priors(
 
 
 def _fit_most(anchors: KnownPositions, t: FloatArray) -> bool:
-    """Return whether the kernel reaches half of the anchors; true where these are too few to tell."""
+    """Return whether the kernel reaches half of the anchors; true where they do not check one another."""
     held = anchors.chi2(t) <= KERNEL_WIDTH**2
     return len(held) < FEWEST_CHECKED or bool(np.mean(held) >= 0.5)
 
