@@ -160,7 +160,7 @@ def test_a_wrong_prior_is_named_though_control_points_set_the_axes_and_meters_ar
     off = {row.name: row.prior_off for row in found.cameras}
     assert max(off, key=off.get) == "0004.jpg"
     assert found.facts.figures.sigma_unit == "m"
-    told = {row.name: row.lines for row in found.told.rows}
+    told = {row.label: row.lines for row in found.told.rows}
     assert " mm (root mean square), P" in told["control points"][0]
 
 
