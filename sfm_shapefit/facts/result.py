@@ -214,7 +214,7 @@ class LocateResult(_Placed):
     loops: tuple[Loop, ...] = ()
     """Loops of the videos among the images, where `map` looked for some."""
     prior_fit: PriorFit | None = None
-    """How well position priors fit the images and the `directions`; None where they cannot tell."""
+    """How well position priors fit the images and the `directions`; None where there are too few or none."""
     support: Support
     """Images (n,) left out for their points, and which observations agree with the cameras."""
     evidence: ModelEvidence = field(default_factory=ModelEvidence)

@@ -83,7 +83,7 @@ def _resize_sensors(state: ModelState) -> Template:
 
 
 def _compare_with_priors(state: ModelState) -> PriorFit | None:
-    """Return how well position priors fit the delivered images; None if they cannot tell.
+    """Return how well position priors fit the delivered images; None without any that serve.
 
     Where something else set origin and axes, they are compared after a fit, if enough check one another.
     """
