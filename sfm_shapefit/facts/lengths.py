@@ -109,7 +109,7 @@ class LengthsFacts(Record):
 
     def told(self) -> list[Row]:
         """Return what the terminal says."""
-        to = self.control_points
+        control = [describe_control_points(to.points), to.statement] if (to := self.control_points) else []
         scale = f"known to {100.0 * (self.scale_sigma or 0.0):.2g} %, included"
         unknown = f"its error is not known{', and not included' if self.usual else ''}"
         none = "their errors are not known; a model of at most 2,000 frames with 3D points tells them"
@@ -118,7 +118,7 @@ class LengthsFacts(Record):
             Row("between", [f"{one.first} and {one.second}: {one.length.interval}" for one in self.lengths]),
             row("scale", unknown if self.scale_sigma is None else scale),
             Row("scale bars", [one.line for one in self.scale_bars]),
-            Row("control points", [describe_control_points(to.points), to.statement] if to else []),
+            Row("control points", list(filter(None, control))),
             Row("warning", self.warnings),
         ]
 
