@@ -98,7 +98,13 @@ class ModelVerdict(Record):
         if reason is None:
             return self
         grade = Grade.LOOK if self.grade is Grade.GOOD else self.grade
-        return self.weigh((replace(reason, grade=grade), *self.findings))
+        others = (one for one in self.findings if one != reason)
+        return self.weigh((replace(reason, grade=grade), *others))
+
+    def fault_of_input(self, num_images: int) -> Reason | None:
+        """Return the finding that half of some images have keypoints, or a rig, which explain the others."""
+        of_input = (one for one in self.findings if one.kind is Kind.INPUT)
+        return next((one for one in of_input if 2 * len(one.images) >= num_images), None)
 
     def _sentence(self) -> str:
         if self.grade is Grade.GOOD:

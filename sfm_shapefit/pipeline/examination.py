@@ -17,6 +17,7 @@ from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
 from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape
 from sfm_shapefit.judgement.flights import find_flights
+from sfm_shapefit.judgement.lens_residuals import find_bent_lenses
 from sfm_shapefit.judgement.lenses import find_odd_lenses
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, SMALLEST_SHAPE
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
@@ -48,7 +49,8 @@ def gather_evidence(
     points, images, pictures, among, asked = structure
     _, lenses = question_lenses(points, images, pictures, threads, among, images_to_ask(images, asked))
     bogus = np.array([is_bogus(lens) for lens in images.lenses], dtype=np.bool_)
-    odd = (*find_odd_lenses(images, points, pictures, bogus), *find_flights(images))
+    odd = (*find_odd_lenses(images, points, pictures, bogus), *find_bent_lenses(structure))
+    odd = (*odd, *find_flights(images))
     if fits is None:
         return ModelEvidence(lenses=lenses, odd=odd)
     odd = (*odd, *find_contradicted_rigs(images, fits.directions))

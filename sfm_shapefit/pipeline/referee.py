@@ -164,10 +164,11 @@ def grade_model(state: CheckState, clock: Clock) -> CheckState:
     if verdict.is_bad and (far := source.inputs.far):
         near = check_source(state.model, source.without(far), state.options, clock.anew()).verdict
         verdict = verdict if near.is_bad else ModelVerdict.weigh(of_alike_pictures(verdict.findings))
-    recognized = recognize_resolution(*state.structure[:3])
+    recognized, fault = recognize_resolution(*state.structure[:3]), None
     if verdict.is_bad and recognized is None:
-        recognized = ask_convention(source, clock.threads)
-    verdict = verdict.led_by(recognized and of_model(Kind.INPUT, recognized.sentence))
+        fault = verdict.fault_of_input(state.images.num_images)
+        recognized = None if fault else ask_convention(source, clock.threads)
+    verdict = verdict.led_by(fault or (recognized and of_model(Kind.INPUT, recognized.sentence)))
     return replace(state, reasons=reasons, verdict=verdict)
 
 

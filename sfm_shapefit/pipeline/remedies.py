@@ -15,6 +15,7 @@ from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.limits import OUTNUMBERED
+from sfm_shapefit.judgement.rig_offsets import find_contradicted_rigs
 from sfm_shapefit.judgement.wrong_lenses import is_like_others
 from sfm_shapefit.pipeline.conventions import ask_resolution
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
@@ -71,8 +72,12 @@ def make_model(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateRe
     """
     result, notes = _run_in_scale(inputs, source, clock), tuple[str, ...]()
     if isinstance(result, str):
+        given, why = inputs.images.sensors, result
         inputs, source = at_one_center(inputs, source)
-        notes, result = (result,), _run(inputs, source, clock)
+        result = _run(inputs, source, clock)
+        images = result.images.with_sensors(given.rotations, given.translations)
+        wrong = (one.statement for one in find_contradicted_rigs(images, result.directions))
+        notes = (f"{next(wrong, why)}, so the sensors of a rig are taken to share one center",)
     for remedy in find_remedies(result, inputs, source):
         again = _run(remedy.inputs, remedy.source, clock)
         if remedy.is_better(again, result):
@@ -113,7 +118,7 @@ def _run_in_scale(inputs: RunInputs, source: MatchSource, clock: Clock) -> Locat
     if longest > 0.0 and sigma is not None and sigma > _OPEN_SCALE:
         return (
             f"the offsets of sensors in their rigs, at most {longest:.2g}, are too short for this scene to "
-            "tell its scale, so the sensors of a rig are taken to share one center"
+            "tell its scale"
         )
     return result
 

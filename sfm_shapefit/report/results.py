@@ -16,8 +16,8 @@ from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.files.colmap.points import structure_of
 from sfm_shapefit.files.colmap.seed import pick_points
 from sfm_shapefit.judgement.image_quality import ImageQuality
+from sfm_shapefit.judgement.lens_residuals import lens_fields
 from sfm_shapefit.report.drawing import MAX_POINTS, CameraColumn, Drawing, LensRow, build_drawing, poses_of
-from sfm_shapefit.report.lens_residuals import lens_fields
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 

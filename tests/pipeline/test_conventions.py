@@ -123,6 +123,27 @@ def test_keypoints_of_a_picture_that_is_turned_by_90_degrees_are_told(tmp_path):
     assert len(told()) == 1
 
 
+def test_keypoints_outside_their_pictures_come_before_axes_that_they_seem_to_be_in(tmp_path):
+    folder = copied(RING, tmp_path)
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    (camera,) = model.cameras.values()
+
+    def turned(pixels):
+        return np.stack([camera.height - pixels[:, 1], pixels[:, 0]], axis=1)
+
+    for image in model.images.values():
+        for point in image.points2D:
+            (point.xy,) = turned(point.xy[None])
+    with pycolmap.Database.open(str(folder / "database.db")) as database:
+        for image in database.read_all_images():
+            pixels = turned(database.read_keypoints(image.image_id)[:, :2])
+            database.update_keypoints(image.image_id, pixels.astype(np.float32))
+    verdict = check(model, folder / "database.db", second_opinion=False).verdict
+    assert verdict.is_bad
+    assert "keypoints outside the picture" in verdict.reasons[0]
+    assert not any("IMU" in reason for reason in verdict.reasons)
+
+
 def test_a_database_of_pictures_in_another_resolution_is_said():
     model = pycolmap.Reconstruction(RING / "sparse" / "0")
     (camera,) = model.cameras.values()

@@ -275,3 +275,14 @@ def test_several_wrong_lenses_are_one_line_with_the_names_of_their_images():
     (changed,) = (warning for warning in freed.warnings if "focal length" in warning)
     assert all(name in line and name in changed for name in names)
     assert changed.count("images contradicted what was given") == 1
+    assert not any("too far" in one.sentence for one in freed.verdict.findings)
+
+
+def test_a_known_focal_length_that_changed_by_more_than_one_of_exif_data_is_to_be_looked_at():
+    truth = pycolmap.Reconstruction(COURTYARD / "truth")
+    name = truth.image(sorted(truth.reg_image_ids())[5]).name
+    found = sfm_shapefit.locate(with_own_lenses(truth, {name: 0.6}), COURTYARD / "database.db")
+    (told,) = (one for one in found.verdict.findings if "too far for one that was known" in one.sentence)
+    assert told.images == (name,)
+    assert "focal length 432.0 px (given) became 7" in told.sentence
+    assert found.verdict.grade.value == "look"

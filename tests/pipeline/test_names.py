@@ -17,7 +17,7 @@ from sfm_shapefit.files.colmap.gravity import table_gravity
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.reconstructions import name_of
 from sfm_shapefit.files.pair_list import read_pair_list
-from tests.program import run
+from tests.program import run, run_refused
 from tests.scenes import BUNDLED, RING, edit_database, fingerprint
 
 MODEL = Path("sparse") / "0"
@@ -104,6 +104,12 @@ def test_names_that_are_no_utf8_go_through_every_command_as_bytes(tmp_path: Path
         if target.startswith("poses"):
             (tmp_path / target).read_text(encoding="utf-8")
     run("convert", out, tmp_path / "text", "--format", "colmap-txt", code=0)
+    model = pycolmap.Reconstruction(out)
+    min(model.images.values(), key=lambda image: image.image_id).name = "broken\nname.jpg"
+    model.write(tmp_path)
+    said = run_refused("convert", tmp_path, tmp_path / "lines", "--format", "colmap-txt")
+    assert r"the name of image 'broken\nname.jpg' has a line break" in said
+    assert not (tmp_path / "lines").exists()
     assert evaluate(tmp_path / "text", out).position.max < 1e-9
     run("locate", tmp_path / "poses.json", tmp_path / "again", "--database", folder / "database.db", code=0)
     for path in (*out.glob("*.csv"), *out.glob("*.html"), tmp_path / "errors.csv"):

@@ -197,6 +197,20 @@ def test_offsets_too_short_to_tell_the_scale_leave_it_open_and_that_is_said(tmp_
         assert ["are too short for this scene to tell its scale" in said for said in found.warnings] == [True]
 
 
+def test_offsets_that_matches_contradict_are_not_said_to_be_short(tmp_path):
+    write_scene(tmp_path, [ONE, STEREO], [Shots(1, (0, 1))] * 8, seed=3)
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        (rig,) = (one for one in database.read_all_rigs() if one.num_sensors() == 2)
+        ((sensor, _),) = rig.non_ref_sensors.items()
+        ahead = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.0, 0.0, 0.5]))  # right, in truth
+        rig.set_sensor_from_rig(sensor, ahead)
+        database.update_rig(rig)
+    found = sfm_shapefit.map_database(tmp_path / "database.db").models[0]
+    assert "a place in its rig that matches inside its frame contradict by 9" in found.warnings[0]
+    assert found.warnings[0].endswith("so the sensors of a rig are taken to share one center")
+    assert not any("too short" in said for said in found.warnings)
+
+
 def test_sensors_that_share_a_center_turn_but_stay_there_if_rigs_are_free(six):
     found = sfm_shapefit.map_database(six[0] / "database.db", rigs="free").models[0]
     assert_right(found.reconstruction, six[1])

@@ -235,6 +235,11 @@ def write_model(
     if not text:
         write_binary(model, folder)
         return
+    if broken := [name for name in model.images.names if "\n" in name or "\r" in name]:
+        raise InputError(
+            f"the name of image {broken[0]!r} has a line break, which a text model cannot hold; "
+            "rename it, or write a binary model"
+        )
     try:
         reconstruction_of(model).write_text(folder)
         read_folder(folder)

@@ -7,7 +7,7 @@ import pytest
 from sfm_shapefit import check
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import structure_of
-from sfm_shapefit.report.lens_residuals import lens_fields
+from sfm_shapefit.judgement.lens_residuals import lens_fields
 from tests.lens_scene import camera_of_model, write_scene
 from tests.report.test_report_page import data_of, unpacked
 
@@ -86,12 +86,17 @@ def test_noise_is_no_pattern_whatever_its_seed(scene):
     assert sum(one != NONE for one in said) <= 1
 
 
-def test_a_lens_without_its_distortion_points_outward_at_the_rim_and_the_page_draws_it(scene, tmp_path):
+def test_a_lens_without_its_distortion_is_to_be_looked_at_and_the_page_draws_it(scene, tmp_path):
     model, said = pycolmap.Reconstruction(scene), {}
     for bend in (0.15, 0.0):
         model.cameras[1].params = [500.0, 320.0, 240.0, bend]
         page = tmp_path / f"{bend}.html"
-        check(model, second_opinion=False).report(page)
+        found = check(model, second_opinion=False)
+        found.report(page)
+        fits = [one.sentence for one in found.verdict.findings if "a lens that does not fit" in one.sentence]
+        assert [one.startswith("12 images have") and "point outward by" in one for one in fits] == (
+            [] if bend else [True]
+        )
         (field,) = data_of(page.read_text(encoding="utf-8"))["fields"]
         said[bend] = field["statement"]
         assert len(unpacked(field["places"])) == len(unpacked(field["means"])) > 20
