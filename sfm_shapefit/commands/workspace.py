@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
@@ -31,7 +32,7 @@ from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
 from sfm_shapefit.files.colmap.pinholes import Flat, flats_of, flatten_model, mask_of, write_flats
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
-from sfm_shapefit.files.colmap.world import World, is_too_far, world_of
+from sfm_shapefit.files.colmap.world import float32_world
 from sfm_shapefit.files.undistortion_options import UndistortionOptions
 from sfm_shapefit.report.mesh import nerf_files
 from sfm_shapefit.rotations.gravity import DOWN, turn_upright
@@ -109,7 +110,7 @@ def workspace(
         turn, statement = (
             _level(read, model) if options.level == "auto" else (None, "its axes stay, as asked")
         )
-        world = _world(read, turn, options.offset)
+        world = float32_world(_places(read, turn), options.offset)
         moved = read.reconstruction if turn is None else transform_model(read.reconstruction, turn)
         moved = moved if world.is_own else transform_model(moved, world.similarity(read.images.centers))
     protect = [images, *([model] if isinstance(model, Path | str) else []), *([masks] if masks else [])]
@@ -182,12 +183,11 @@ def _level(read: ColmapModel, source: ModelSource) -> tuple[Similarity | None, s
     return turn, f"leveled, z points up; up is {known}"
 
 
-def _world(model: ColmapModel, turn: Similarity | None, offset: str) -> World:
-    """Return where a model is written after a turn: with an offset that is given, or that float32 needs."""
+def _places(model: ColmapModel, turn: Similarity | None) -> FloatArray:
+    """Return where cameras and some points stand after a turn, (k, 3)."""
     points = pick_points(model.reconstruction, _MOST_POINTS).xyz
     own = np.concatenate([model.images.centers, points])
-    places = own if turn is None else turn.apply(own)
-    return World() if offset == "auto" and not is_too_far(places) else world_of(None, places, "", offset)
+    return own if turn is None else turn.apply(own)
 
 
 def _write_models(model: ColmapModel, folder: Path, masks: str) -> None:

@@ -120,6 +120,19 @@ def world_of(datum: EarthDatum | None, centers: FloatArray, crs: str, offset: st
     return replace(world, offset=(x, y, z)) if offset else world
 
 
+def float32_world(places: FloatArray, offset: str) -> World:
+    """Return the world of a model for programs that read float32: its own, or with an offset.
+
+    Args:
+        places: (k, 3) of its cameras and points.
+        offset: three numbers, or auto: one that is found where float32 is too coarse, else none.
+
+    Raises:
+        InputError: if `offset` is none.
+    """
+    return World() if offset == "auto" and not is_too_far(places) else world_of(None, places, "", offset)
+
+
 def _round_middle(places: FloatArray) -> list[float]:
     """Return the median of places (k, 3), rounded to hundreds or, in a smaller scene, as float32 needs."""
     spread, decimals = median_spread(places), _LEAST_DECIMALS
