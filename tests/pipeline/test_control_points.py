@@ -250,6 +250,11 @@ TWICE = [line(k, image) for k in range(4) for image in ("0001.jpg", "0002.jpg")]
             "2 of the control points have marks in two images of the model, and scale and axes",
         ),
         ("local", TWICE[::2], "0 of the control points have marks in two images"),
+        (
+            "local",
+            [line.replace("0002.jpg", "9999.jpg") for line in TWICE],
+            "in two images of the model, and scale and axes need three; the model has no 9999.jpg",
+        ),
         ("local", [line.replace("P3", "CHK-3").replace("P2", "CHK-2") for line in TWICE], "2 of the control"),
         (
             "local",
