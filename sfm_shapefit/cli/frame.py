@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     Result = LocateResult | MapResult | GraphResult | JoinedModel
 
-_BLACK = "the points have none; --images FOLDER gives them those of the images"
+_BLACK = "the points have none; --images FOLDER takes them from the images"
 _IN_PLACE_OF_FILES = {OF_DATABASE, SOLVED}
 """Words that options take where else they take a file."""
 _NOTICED_S = 1.0  # seconds; a user does not notice less compiling
@@ -89,7 +89,7 @@ class Run(Generic[S]):
         opened = f"; open {first_of([*map(shlex.quote, pages)])}" if self.flags.report else ""
         images = self.flags.images if self._has_pictures(found.image_names) else ""
         model = out / told.folders[0]
-        step = told.step.at(out=model, out_dense=f"{model}_dense", images=images or "IMAGES").command
+        step = told.step.at(out=model, out_dense=f"{model}_dense", images=images or "IMAGES")
         print_ending(found.verdict.grade.value, found.verdict.statement, f"written to {out}/{opened}", step)
 
     def _has_pictures(self, names: Sequence[str]) -> bool:
