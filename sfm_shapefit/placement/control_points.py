@@ -156,9 +156,8 @@ def control_gauge(before: Gauge, control: ControlPoints, fit: ControlFit, *, res
     used = int(np.sum(~control.is_check & np.isfinite(fit.residuals[:, 0])))
     sentence = f"the scale is known to {100.0 * fit.scale_sigma:.2g} %"
     unit = " m" if control.datum else ""
-    agree = (
-        f"{control.statement}; {int(fit.fitting.sum())} of {used} agree, to {fit.sigma:.3g}{unit} per axis"
-    )
+    agree = f"{control.statement}; {int(fit.fitting.sum())} of {used} agree, "
+    agree += f"with a standard deviation of {fit.sigma:.3g}{unit} per axis"
     gauge = replace(
         before,
         similarity=compose(total, before.similarity),
