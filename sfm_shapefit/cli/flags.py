@@ -386,7 +386,7 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
     homes = homes_of(settings)
     known = {*homes, *homes.values()}
     try:
-        read = tomllib.loads(text)
+        read = tomllib.loads(f"{text}\n")  # errors of the last line are told by its number, too
     except (ValueError, RecursionError) as error:
         if answer := answer_for_file(_names_in_ini(text), flags_and_keys()):
             raise typer.BadParameter(f"{path} {answer}") from error
