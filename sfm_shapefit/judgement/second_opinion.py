@@ -103,7 +103,7 @@ class SecondOpinion(Record):
             parts.append(f"{are(self.undecided)} elsewhere {by}, and no pairs support either place")
         if self.ambiguous:
             where = f"{are(self.ambiguous)} in the same place {by}"
-            parts.append(f"{where}, but at least half as much evidence is for another place or rotation")
+            parts.append(f"{where}, but another place or rotation has at least half as much evidence")
         percent = rounded(100.0 * self.usual, digits=2) if self.usual > _LEAST_TOLD else "less than 0.001"
         usual = f"positions differ by {percent} % of their spread, median"
         if self.wrong or self.undecided:

@@ -50,7 +50,7 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
     assert re.fullmatch(
         r"8 of 8 images placed, \d+ points, mean reprojection error 0\.\d\d px +\d.* s.*", placed
     )
-    assert colors == "colors: the points have none; --images FOLDER gives them those of the images"
+    assert colors == "colors: the points have none; --images FOLDER takes them from the images"
     assert matches.endswith("ring8/database.db; 0 of 16 pairs contradict the result; rotations kept")
     assert re.fullmatch(r"positions known to ± \S+ % of the scene", known)
     assert verdict == "verdict: good"
@@ -77,7 +77,7 @@ def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
     lost = replace(facts, figures=replace(facts.figures, sigma_of_extent=1.5))
     assert lost.told((), "").lines[2] == "the uncertainty of positions is not known"
     metric = replace(facts, figures=replace(facts.figures, sigma_unit=UNITS["prior"]))
-    assert metric.told((), "").lines[2].endswith("12 % of the scene (0.5 of the priors' units)")
+    assert metric.told((), "").lines[2].endswith("12 % of the scene (0.5 in the priors' units)")
     assert figures.sigma == pytest.approx(np.median(drawing.cameras.sigmas[drawing.cameras.placed]))
     assert f"± {100 * figures.sigma_of_extent:.2g} % of the scene" in result.stdout
 
