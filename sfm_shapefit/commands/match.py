@@ -4,6 +4,7 @@ images and lenses -> features -> pairs -> matches and two-view geometries
 """
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -58,22 +59,34 @@ def match_images(
 
     Raises:
         InputError: if there are no two images that can be read, or the database is of other images.
+
+    Warns:
+        UserWarning: if photographs or videos in the folder cannot be read.
     """
     options = merge_options(options, MatchingOptions, overrides)
     clock = Clock.of(progress, SolverOptions(threads=threads).threads)
-    match_begun(begin_database(Path(images), Path(database), options, clock), clock)
+    made, notes = begin_database(Path(images), Path(database), options, clock)
+    match_begun(made, clock)
+    for note in notes:
+        warnings.warn(note, stacklevel=2)
     return Path(database)
 
 
-def begin_database(folder: Path, path: Path, options: MatchingOptions, clock: Clock) -> PhotographDatabase:
-    """Return the database of a folder's photographs, with images and lenses; errors as `match_images`."""
+def begin_database(
+    folder: Path, path: Path, options: MatchingOptions, clock: Clock
+) -> tuple[PhotographDatabase, list[str]]:
+    """Make a database of photographs with images and lenses; errors as `match_images`.
+
+    Returns:
+        the database, and what the user should know, a sentence each.
+    """
     refuse_lens(options)
     if options.mask_path:
         refuse_no_folder(Path(options.mask_path), MASKS)
     found = find_photographs(folder)
-    refuse_rigs(options, found)
+    refuse_rigs(options, found.names)
     made = PhotographDatabase(
-        folder=folder, database=path, names=found, options=options, threads=clock.threads
+        folder=folder, database=path, names=found.names, options=options, threads=clock.threads
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     _remember(path, options)
@@ -84,7 +97,9 @@ def begin_database(folder: Path, path: Path, options: MatchingOptions, clock: Cl
         path.unlink()
         _record_of(path).unlink()
         raise InputError(f"{folder} has no two images that pycolmap can read; not {first_of(unreadable)}")
-    return made
+    unused = [*found.unread, *unreadable]
+    why = "not used, since pycolmap cannot read them"
+    return made, [f"{why}: {first_of(unused)} in {folder}"] if unused else []
 
 
 def match_begun(made: PhotographDatabase, clock: Clock) -> None:

@@ -26,7 +26,7 @@ from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.command_options import LocateOptions, MapOptions
 from sfm_shapefit.facts.control_points import describe_control_points
 from sfm_shapefit.facts.model import FactsOfModel, JoinedFacts
-from sfm_shapefit.facts.placed import Facts, GraphFacts, Piece
+from sfm_shapefit.facts.placed import METERS, Facts, GraphFacts, Piece
 from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.report.charts import (
@@ -393,7 +393,8 @@ def _notes(drawing: Drawing, residuals_deg: Mapping[str, FloatArray]) -> dict[st
 
 
 def _control_note(facts: Facts) -> str:
-    off = shorten(describe_control_points(getattr(facts, "control_points", ())))
+    unit = METERS if facts.figures.unit == METERS else ""
+    off = shorten(describe_control_points(getattr(facts, "control_points", ()), unit))
     note = "The position in the model minus the known one; check points do not set scale and axes."
     return f"{off[:1].upper()}{off[1:]}. {note}"
 
