@@ -174,7 +174,7 @@ def test_a_wrong_prior_is_named_though_control_points_set_the_axes_and_meters_ar
     assert max(off, key=off.get) == "0004.jpg"
     assert found.facts.figures.sigma_unit == "m"
     told = {row.label: row.lines for row in found.told.rows}
-    assert " mm (root mean square), P" in told["control points"][0]
+    assert " mm in space (root mean square), P" in told["control points"][0]
 
 
 def test_evaluate_maps_a_finished_model_onto_control_points_and_tells_both_errors(ring, tmp_path):
