@@ -118,7 +118,7 @@ def test_what_map_doubts_check_does_not_call_good():
         assert found.verdict.cameras == doubted
         assert found.facts.evidence.second.ambiguous == doubted
         assert (
-            "at least half as much evidence is for another place or rotation"
+            "evidence at least half as strong puts them elsewhere, or turns them"
             in found.facts.evidence.second.statement
         )
         assert " workspace " in found.facts.next_step.command  # it would be placed there again
@@ -200,6 +200,20 @@ def test_a_model_that_nothing_speaks_for_does_not_pass_strict(tmp_path):
     strangers = spoiled(tmp_path / "strangers", names="other-{}".format)
     database = ("--database", RING / "database.db")
     assert "has 0 of the model's 8 images" in run_refused("check", strangers, *database)
+
+
+def test_an_output_is_judged_by_the_database_that_it_names_while_that_has_its_images(tmp_path, ring_mapped):
+    database = shutil.copy(RING / "database.db", tmp_path / "ring.db")
+    found = replace(ring_mapped.models[0], inputs=replace(ring_mapped.models[0].inputs, database=database))
+    found.write(tmp_path / "far/below/0")
+    judged = check(tmp_path / "far/below/0", second_opinion=ring_mapped).facts
+    assert judged.has_matches
+    assert judged.inputs.directions == f"inlier matches of {database} (which the model's locate.json names)"
+    run("check", tmp_path / "far/below/0", "--strict", "--no-second-opinion", "-q", code=0)
+    shutil.copy(COURTYARD / "database.db", database)
+    assert not check(tmp_path / "far/below/0").facts.has_matches
+    Path(database).unlink()
+    assert not check(tmp_path / "far/below/0").facts.has_matches
 
 
 def test_a_model_beside_another_scenes_database_is_doubted():

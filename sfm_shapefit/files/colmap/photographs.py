@@ -58,8 +58,9 @@ def find_photographs(folder: Path) -> list[str]:
             if any((model / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
                 anew = f"sfm-shapefit locate {model} OUT places its images anew"
                 raise InputError(f"{model} is a COLMAP model without a database.db; {anew}")
-        found = "no image" if not names else f"only {names[0]}"
-        unread = f" and {first_of([f'{n} {suffix}' for suffix, n in others.items()])}" if others else ""
+        found = f"only {names[0]}" if names else "no image that can be read"
+        more = first_of([f"{n} {suffix}" for suffix, n in others.items()])
+        unread = f"{' and' if names else ', only'} {more}" if more else ""
         advice = "; convert these to .jpg first" if others else "; give a folder of two images or more"
         raise InputError(f"{folder} has no database.db and holds {found}{unread}{advice}")
     return sorted(names)
