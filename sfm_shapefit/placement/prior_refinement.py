@@ -78,9 +78,9 @@ def pull_to_priors(
 
 
 def _fit_most(anchors: KnownPositions, t: FloatArray) -> bool:
-    """Return whether the kernel reaches half of the anchors; all of so few that do not check one another."""
+    """Return whether the kernel reaches half of the anchors; true where they do not check one another."""
     held = anchors.chi2(t) <= KERNEL_WIDTH**2
-    return bool(np.mean(held) >= (0.5 if len(held) >= FEWEST_CHECKED else 1.0))
+    return len(held) < FEWEST_CHECKED or bool(np.mean(held) >= 0.5)
 
 
 def _vagueness(anchors: KnownPositions, t: FloatArray) -> float:

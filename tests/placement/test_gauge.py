@@ -277,6 +277,21 @@ def test_a_fifth_of_the_priors_off_by_100_sigma_does_no_harm():
     assert gauge.warning == ""
 
 
+@pytest.mark.parametrize("count", [12, 14, 25])
+def test_nearly_half_of_the_priors_off_by_one_shift_have_no_part_and_lie_on_no_line(count):
+    for seed in range(3):
+        rng, t = np.random.default_rng(seed), cameras(seed, count)
+        angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+        t = np.stack([np.cos(angle), np.sin(angle), 0.03 * t[:, 2]], axis=1)
+        truth = 50.0 * t @ TURN.T + [7.0, -300.0, 20.0]
+        told = truth + rng.normal(0.0, 0.02, t.shape)
+        told[: (count - 1) // 2] += [30.0, 10.0, 5.0]
+        gauge = prior_gauge(t, made_priors(told))
+        assert gauge.warning == ""
+        # Right ones are on half of the circle: on the other, their fit is off by several of their errors.
+        assert np.abs(gauge.apply(t) - truth).max() < 10 * 0.02
+
+
 @pytest.mark.parametrize(
     ("positions", "rows", "message"),
     [
