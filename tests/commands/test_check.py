@@ -206,6 +206,7 @@ def test_an_output_is_judged_by_the_database_that_it_names_while_that_has_its_im
     database = shutil.copy(RING / "database.db", tmp_path / "ring.db")
     found = replace(ring_mapped.models[0], inputs=replace(ring_mapped.models[0].inputs, database=database))
     found.write(tmp_path / "far/below/0")
+    assert repr(ring_mapped) == "<MapResult: good: 8 of 8 images placed in 1 model>"
     judged = check(tmp_path / "far/below/0", second_opinion=ring_mapped).facts
     assert judged.has_matches
     assert judged.inputs.directions == f"inlier matches of {database} (which the model's locate.json names)"
