@@ -40,6 +40,13 @@ class NextStep(NamedTuple):
 
     text: str
     command: str
+    condition: str = ""
+    """When to do it, a clause; empty for at once."""
+
+    @property
+    def line(self) -> str:
+        """What the terminal says of it; the command stands last, so that it can be copied."""
+        return f"next{self.condition and f', {self.condition}'}: {self.command}"
 
     def at(self, **folders: Path | str) -> "NextStep":
         """Return the step with some folders in place of the words that stand for them."""

@@ -20,6 +20,12 @@ METRIC_SIGMA = 0.1
 INSIDE = 30.0
 """Median distances from the median; cameras and points within say how large the scene is."""
 
+FLOAT32_REACH = 1e-6 * 2.0**24
+"""Median spreads from the origin within which float32 moves no point by more than a millionth of a spread.
+
+That is hundredths of a pixel in a picture of the scene.
+"""
+
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])
 """Turn of camera axes about x, its own inverse: y up, looking along -z (OpenGL, NeRF), to COLMAP's."""
 

@@ -148,7 +148,7 @@ def check_command(
             told = found.facts.told(found.cameras, found.pairs)
             print_answer(told)
             written = "" if report is None else f"written to {report}; open {shlex.quote(str(report))}"
-            print_ending(found.verdict.grade.value, found.verdict.statement, written, told.step.command)
+            print_ending(found.verdict.grade.value, found.verdict.statement, written, told.step)
         if strict:
             _be_strict(is_usable=found.verdict.is_usable, has_matches=found.facts.has_matches)
 
@@ -216,5 +216,5 @@ def _check_pieces(
         told = found.told
         print_answer(told)
         if told.step.command:
-            print_lines([f"next: {told.step.command}"])
+            print_lines([told.step.line])
     return found

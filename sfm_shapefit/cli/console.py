@@ -16,7 +16,7 @@ from typing import Any
 
 import typer
 
-from sfm_shapefit.base.display import Row, Telling
+from sfm_shapefit.base.display import NextStep, Row, Telling
 from sfm_shapefit.base.errors import MissingExtraError, ShapeFitError, UnsolvableError
 from sfm_shapefit.base.wording import make_printable
 
@@ -242,10 +242,10 @@ def print_answer(told: Telling, time_taken: str = "") -> None:
         print_lines([f"{label}: {line}" for line in shown], _WARNING_STYLE if label == "warning" else "")
 
 
-def print_ending(grade: str, verdict: str, written: str, step: str) -> None:
+def print_ending(grade: str, verdict: str, written: str, step: NextStep) -> None:
     """Print on stdout how good a model is, what was written, and the next command, which can be copied."""
     print_lines([f"verdict: {verdict}"], _GRADE_STYLES[grade])
-    print_lines([line for line in (written, f"next: {step}") if line])
+    print_lines([line for line in (written, step.line) if line])
 
 
 def print_lines(lines: Iterable[str], style: str = "") -> None:
@@ -255,7 +255,7 @@ def print_lines(lines: Iterable[str], style: str = "") -> None:
 
     console = Console()
     for line in lines:
-        breaks = console.is_terminal and not line.startswith(("next: ", "written to "))
+        breaks = console.is_terminal and not line.startswith(("next: ", "next, ", "written to "))
         console.print(Text(_encodable(in_flags(line)), style), soft_wrap=not breaks)
 
 

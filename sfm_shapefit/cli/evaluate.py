@@ -33,7 +33,7 @@ _TABLES = {".csv", ".txt"}
 @app.command(
     "evaluate",
     cls=GroupedCommand,
-    short_help="Compare a model's poses with a reference, or its lengths with scale bars.",
+    short_help="Compare a model's poses with a reference, or MODEL with control points or scale bars.",
     epilog="Example: sfm-shapefit evaluate out truth --csv errors.csv",
 )
 def evaluate_command(
@@ -71,6 +71,10 @@ def evaluate_command(
         ),
     ] = None,
     scale_bars: ScaleBarsFile = None,
+    control_points: Annotated[
+        Path | None,
+        typer.Option("--control-points", metavar="FILE", help="Points of known position, as of `locate`."),
+    ] = None,
     csv: Annotated[
         Path | None, typer.Option("--csv", metavar="FILE", help="Write one row per camera to FILE.")
     ] = None,
@@ -82,15 +86,18 @@ def evaluate_command(
 ) -> None:
     """Compare the camera poses of MODEL with those of REF, after a robust similarity alignment.
 
-    Without REF: how well lengths of MODEL are known, and how it compares with scale bars.
+    Without REF: how well lengths of MODEL are known, and how it compares with scale bars or control points.
     """
     source = one_path(model, input_path, "MODEL")
     if reference is None and not (threshold or trajectory or csv):
-        _tell_lengths(source, length or [], scale_bars, as_json=as_json)
+        known = {"scale_bars": scale_bars, "control_points": control_points}
+        _tell_lengths(source, length or [], known, as_json=as_json)
         return
     truth = one_path(reference, None, "REF")
-    if length or scale_bars:
-        raise typer.BadParameter("lengths and scale bars are of MODEL alone; leave REF out", param_hint="REF")
+    if length or scale_bars or control_points:
+        raise typer.BadParameter(
+            "lengths, bars and points are of MODEL alone; leave REF out", param_hint="REF"
+        )
     with report_errors():
         from sfm_shapefit.base.atomic_folder import atomic_file
         from sfm_shapefit.base.paths import refuse_absent
@@ -123,20 +130,21 @@ def evaluate_command(
                 print_lines([f"next: sfm-shapefit evaluate {both} --csv errors.csv"])
 
 
-def _tell_lengths(source: Path, lengths: list[str], bars: Path | None, *, as_json: bool) -> None:
+def _tell_lengths(source: Path, lengths: list[str], known: dict[str, Path | None], *, as_json: bool) -> None:
     with report_errors():
         from sfm_shapefit.base.paths import refuse_absent
         from sfm_shapefit.commands.lengths import evaluate_lengths
 
-        refuse_absent(source, *filter(None, [bars]))
-        found = evaluate_lengths(source, [split_values("length", one) for one in lengths], scale_bars=bars)
+        refuse_absent(source, *filter(None, known.values()))
+        ends = [split_values("length", one) for one in lengths]
+        found = evaluate_lengths(source, ends, **known)
         if as_json:
             print_json(found.summary())
         else:
             print_table(str(source), found.told(), "see --json")
             model = shlex.quote(str(source))
             step = f"evaluate {model} --length PLACE PLACE" if not lengths else f"check {model}"
-            if found.scale_sigma is None and not bars:
+            if found.scale_sigma is None and not any(known.values()):
                 step = f"locate {model} OUT --known-distance NAME NAME DISTANCE"
             print_lines([f"next: sfm-shapefit {step}"])
 

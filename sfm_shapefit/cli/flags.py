@@ -87,6 +87,7 @@ _METAVARS: dict[Any, str] = {
     "config": "FILE",
     "images": "FOLDER",
     "mask_path": "FOLDER",
+    "offset": "X,Y,Z",
     "rig_config_path": "FILE",
     int: "INTEGER",
     float: "NUMBER",

@@ -89,7 +89,7 @@ class Run(Generic[S]):
         opened = f"; open {first_of([*map(shlex.quote, pages)])}" if self.flags.report else ""
         images = self.flags.images if self._has_pictures(found.image_names) else ""
         model = out / told.folders[0]
-        step = told.step.at(out=model, out_dense=f"{model}_dense", images=images or "IMAGES").command
+        step = told.step.at(out=model, out_dense=f"{model}_dense", images=images or "IMAGES")
         print_ending(found.verdict.grade.value, found.verdict.statement, f"written to {out}/{opened}", step)
 
     def _has_pictures(self, names: Sequence[str]) -> bool:

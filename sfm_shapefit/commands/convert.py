@@ -138,7 +138,7 @@ def write_converted(
     from sfm_shapefit.files.colmap.listed_poses import read_by_itself
     from sfm_shapefit.files.colmap.model import model_of, read_model
     from sfm_shapefit.files.colmap.reconstructions import transform_model
-    from sfm_shapefit.files.colmap.world import world_of
+    from sfm_shapefit.files.colmap.world import is_too_far, world_of
     from sfm_shapefit.files.output_paths import refuse_file
 
     name = target_format or _format_of(path)
@@ -158,6 +158,8 @@ def write_converted(
     if not (world.is_own or FORMATS[name].is_exact):
         model = read_model(transform_model(model.reconstruction, world.similarity(centers)))
         statement += world.bend_statement(centers)
+    if name == "nerf" and is_too_far(model.images.centers):  # its readers take float32
+        notes = (*notes, "too far from the origin for float32; give offset=auto")
     statement = "; ".join(filter(None, [statement, *notes]))
     if name in _FOLDERS:
         _write_folder(model, path, name, world, protect)

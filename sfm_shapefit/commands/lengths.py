@@ -8,6 +8,7 @@ import numpy as np
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.place_errors import ScaleErrors, draws_at, errors_of_images
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.facts.control_points import compare_control_points
 from sfm_shapefit.facts.lengths import (
     Axes,
     LengthBetween,
@@ -18,6 +19,7 @@ from sfm_shapefit.facts.lengths import (
 )
 from sfm_shapefit.facts.scale_bars import MeasuredBars, compare_bars
 from sfm_shapefit.facts.tables import model_datum, model_scale_sigma
+from sfm_shapefit.files.colmap.control_points import read_control_points
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.scale_bars import read_scale_bars
@@ -38,8 +40,9 @@ def evaluate_lengths(
     ends: Sequence[tuple[str | int, str | int]] = (),
     *,
     scale_bars: Path | str | None = None,
+    control_points: Path | str | None = None,
 ) -> LengthsFacts:
-    """Return how well lengths in a model are known, and how it compares with known ones.
+    """Return how well lengths in a model are known, and how it compares with known lengths and points.
 
         found = evaluate_lengths("sparse/0", [("0001.jpg", "0004.jpg"), (17, 402)], scale_bars="bars.txt")
         print(found.usual.statement)
@@ -52,9 +55,10 @@ def evaluate_lengths(
         model: a result, reconstruction or model folder, whose images observe points.
         ends: two images, by name, or 3D points, by id, of each distance that is wanted.
         scale_bars: file of known lengths between points, as of `locate`; here they only check.
+        control_points: gcp_list.txt, as of `locate`; a similarity maps the model onto three or more points.
 
     Raises:
-        InputError: if the model or the bars cannot be used, or it has no such image or point.
+        InputError: if the model, the bars or the points cannot be used, or it has no such image or point.
         UnsolvableError: if nothing is known of the errors of the `ends`: where images observe no points, or
             are above 2,000. Without `ends`, `usual` is None then.
     """
@@ -65,20 +69,25 @@ def evaluate_lengths(
     bars = None
     if scale_bars is not None:
         bars = compare_bars(images, read_scale_bars(Path(scale_bars), images), estimate, scale_sigma)
-    datum = model_datum(model)
+    datum, control, of_control = model_datum(model), None, list[str]()
+    if control_points is not None:
+        known = read_control_points(Path(control_points), images)
+        control, of_control = compare_control_points(images, known, datum)
     axes = Axes(unit="m" if datum else "units", has_scale=scale_sigma is not None, has_up=datum is not None)
     scale = ScaleErrors(np.zeros(estimate.num_draws if estimate else 0), scale_sigma or 0.0)
     lengths = list(_between(seen, scale, axes, ends))
-    known = {(one.first, one.second) for one in lengths}
-    unknown = [f"{first} and {second}" for first, second in ends if (str(first), str(second)) not in known]
+    told = {(one.first, one.second) for one in lengths}
+    unknown = [f"{first} and {second}" for first, second in ends if (str(first), str(second)) not in told]
     return LengthsFacts(
         usual=length_between(images, points, estimate, scale, axes),
         lengths=lengths,
         scale_bars=bars.rows() if bars else (),
+        control_points=control,
         scale_sigma=scale_sigma,
         warnings=[
             *posed.notes,
             *(bars.warnings() if bars else ()),
+            *of_control,
             *(f"nothing is known of the error of the distance of {ends}; choose others" for ends in unknown),
         ],
     )

@@ -5,6 +5,7 @@ OUT/masks/               their masks, NAME.png for NAME, if there are any: brush
 OUT/sparse/0/            the model, and its points as points3D.ply: 3DGS, gsplat, brush, LichtFeld
 OUT/sparse/, OUT/stereo/ the model again and the plan of the stereo: COLMAP's dense commands, OpenMVS
 OUT/transforms.json      cameras, and the names of points and masks: nerfstudio
+OUT/offset.xyz           what was subtracted from the coordinates in all of these, if anything was
 """
 
 import os
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
@@ -30,6 +32,7 @@ from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
 from sfm_shapefit.files.colmap.pinholes import Flat, flats_of, flatten_model, mask_of, write_flats
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.files.colmap.seed import pick_points, write_model
+from sfm_shapefit.files.colmap.world import float32_world
 from sfm_shapefit.files.undistortion_options import UndistortionOptions
 from sfm_shapefit.report.mesh import nerf_files
 from sfm_shapefit.rotations.gravity import DOWN, turn_upright
@@ -55,6 +58,8 @@ class Workspace:
     """The model of the pictures."""
     level: str
     """How it was leveled, and how surely, or why not."""
+    offset: tuple[float, float, float]
+    """What was subtracted from all coordinates, after leveling."""
     warnings: tuple[str, ...]
     """The verdict on the model where it is not good, and images that are left out, and why."""
     renamed: Mapping[str, str]
@@ -68,7 +73,10 @@ class Workspace:
         warnings = [f"warning: {one}" for one in self.warnings]
         renamed = [f"{old} becomes images/{new}" for old, new in self.renamed.items()]
         names = [f"pictures: {first_of(renamed)}"] if renamed else []
-        return [counts, *names, f"level: {self.level}", *warnings, f"written to {self.folder}/"]
+        offset = "offset: {!r} {!r} {!r}, subtracted from all coordinates".format(*self.offset)
+        shifted = [f"{offset}, see offset.xyz"] if any(self.offset) else []
+        level = f"level: {self.level}"
+        return [counts, *names, level, *shifted, *warnings, f"written to {self.folder}/"]
 
 
 def workspace(
@@ -93,8 +101,8 @@ def workspace(
         **overrides: single options by name.
 
     Raises:
-        InputError: if the model cannot be read, no picture or mask is one of it, or `out` exists or cannot be
-            written.
+        InputError: if the model cannot be read, no picture or mask is one of it, `offset` is none, or `out`
+            exists or cannot be written.
     """
     options = merge_options(options, UndistortionOptions, overrides)
     masks = Path(options.mask_path) if options.mask_path else None
@@ -107,11 +115,13 @@ def workspace(
         turn, statement = (
             _level(read, model) if options.level == "auto" else (None, "its axes stay, as asked")
         )
-        leveled = read.reconstruction if turn is None else transform_model(read.reconstruction, turn)
+        world = float32_world(_places(read, turn), options.offset)
+        moved = read.reconstruction if turn is None else transform_model(read.reconstruction, turn)
+        moved = moved if world.is_own else transform_model(moved, world.similarity(read.images.centers))
     protect = [images, *([model] if isinstance(model, Path | str) else []), *([masks] if masks else [])]
     with atomic_folder(out, protect=protect) as folder:
         with clock("pictures"):
-            flats, missing = flats_of(leveled, Path(images), options.max_image_size)
+            flats, missing = flats_of(moved, Path(images), options.max_image_size)
             _refuse_no_masks(flats, masks)
             for name in ("images", "masks") if masks else ("images",):
                 (folder / name).mkdir()
@@ -128,15 +138,18 @@ def workspace(
                     f"that it was made of{', and their masks' if masks else ''}"
                 )
         with clock("model"):
-            colored, _ = color_model(leveled, PictureFolder(Path(images), clock.threads))
+            colored, _ = color_model(moved, PictureFolder(Path(images), clock.threads))
             made = flatten_model(colored, flats)
             _write_models(read_model(made), folder, "masks" if masks else "")
+            if world.offset_line:
+                (folder / "offset.xyz").write_bytes(world.offset_line)
     doubt = model_doubt(model)
     warnings = [f"the verdict on the model is: {doubt}"] if doubt else []
     return Workspace(
         folder=Path(out),
         reconstruction=made,
         level=statement,
+        offset=world.offset,
         warnings=(*warnings, *read.notes, *_warn(made, reasons)),
         renamed={flat.name: flat.names[0] for flat in flats if Path(flat.name).name != flat.name},
     )
@@ -176,6 +189,13 @@ def _level(read: ColmapModel, source: ModelSource) -> tuple[Similarity | None, s
         return None, f"z points up already, within {off_deg:.2g} deg; up is {known}"
     turn = Similarity(scale=1.0, rotation=turn_upright(-up.direction), translation=np.zeros(3))
     return turn, f"leveled, z points up; up is {known}"
+
+
+def _places(model: ColmapModel, turn: Similarity | None) -> FloatArray:
+    """Return where cameras and some points stand after a turn, (k, 3)."""
+    points = pick_points(model.reconstruction, _MOST_POINTS).xyz
+    own = np.concatenate([model.images.centers, points])
+    return own if turn is None else turn.apply(own)
 
 
 def _write_models(model: ColmapModel, folder: Path, masks: str) -> None:

@@ -17,6 +17,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import rounded
+from sfm_shapefit.facts.control_points import ControlComparison, describe_control_points
 from sfm_shapefit.facts.scale_bars import ScaleBar
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
@@ -99,6 +100,7 @@ class LengthsFacts(Record):
     ]
     lengths: Annotated[list[LengthBetween], "The distances that were asked for."]
     scale_bars: Annotated[tuple[ScaleBar, ...], "Known lengths between points, and those in the model."]
+    control_points: Annotated[ControlComparison | None, "Points of known position; null if none are given."]
     scale_sigma: Annotated[
         float | None,
         "Relative standard deviation of the scale, which the lengths include; null if not known.",
@@ -107,6 +109,7 @@ class LengthsFacts(Record):
 
     def told(self) -> list[Row]:
         """Return what the terminal says."""
+        control = [describe_control_points(to.points), to.statement] if (to := self.control_points) else []
         scale = f"known to {100.0 * (self.scale_sigma or 0.0):.2g} %, included"
         unknown = f"its error is not known{', and not included' if self.usual else ''}"
         none = "their errors are not known; a model of at most 2,000 frames with 3D points tells them"
@@ -115,6 +118,7 @@ class LengthsFacts(Record):
             Row("between", [f"{one.first} and {one.second}: {one.length.interval}" for one in self.lengths]),
             row("scale", unknown if self.scale_sigma is None else scale),
             Row("scale bars", [one.line for one in self.scale_bars]),
+            Row("control points", list(filter(None, control))),
             Row("warning", self.warnings),
         ]
 

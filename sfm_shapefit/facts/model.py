@@ -325,9 +325,9 @@ def next_of_model(grade: Grade, facts: FactsOfModel) -> NextStep:
         matches = shlex.quote(_from_here(inputs.database)) if inputs.database else "{images}"
         text = "Next: make a model from the matches alone, without the poses of the input."
         return NextStep(text, f"sfm-shapefit map {matches} mapped")
-    looked = ", once you have looked" if grade is Grade.LOOK else ""
-    text = f"Next: undistort the images for splatting or dense reconstruction{looked}."
-    return NextStep(text, "sfm-shapefit workspace {out} {images} {out_dense}")
+    looked = "once you have looked" if grade is Grade.LOOK else ""
+    text = f"Next: undistort the images for splatting or dense reconstruction{looked and f', {looked}'}."
+    return NextStep(text, "sfm-shapefit workspace {out} {images} {out_dense}", looked)
 
 
 def _next_in(folder: str, grade: Grade, facts: FactsOfModel) -> NextStep:

@@ -21,6 +21,11 @@ class UndistortionOptions(Settings):
         "Folder of masks, NAME.png for image NAME, black where nothing is to be learned; OUT/masks has them "
         "without distortion.",
     )
+    offset: str = option(
+        "auto",
+        "X,Y,Z to be subtracted from all coordinates; OUT/offset.xyz tells it. By default round numbers "
+        "where the model is too far from its origin for the float32 of most programs, else 0.",
+    )
     max_image_size: int = option(-1, "Pixels of the longer side of the images that are written, -1 for all.")
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ Do not use, if any of these holds:
     fewer than half of all images are in the output
     more than a tenth of the cameras stand apart from the rest (`seams`, `ties`), or elsewhere in another
     model of the same matches, which pairs support there (`second_opinion`); who stands where it does is to
-    be looked at only
+    be looked at only, and so is a group that repeated structure explains as well
     evidence that the fit did not use speaks against more than a third of them (`evidence`), but for these
     more than a tenth of the images, and two or more, have lenses that cannot be (`lenses`)
 
@@ -92,6 +92,10 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
             Grade.DO_NOT_USE if len(_without(apart, second.confirmed)) > LOCAL_SHARE * count else Grade.LOOK
         )
         yield of_model(Kind.APART, clause, grade, apart)
+    rivals = [name for seam in evidence.seams if seam.is_rival for name in seam.images if name not in named]
+    if rivals := list(dict.fromkeys(rivals)):
+        clause = f"{len(rivals)} of {counted(count, 'camera')} may stand apart from the rest"
+        yield of_model(Kind.APART, clause, images=rivals)
     held = evidence.num_held
     if held is not None and (
         held < RIVAL_SHARE * count or held < SMALLEST_PIECE <= count
@@ -166,7 +170,7 @@ def _weigh_oddities(evidence: ModelEvidence, num_posed: int) -> Iterator[Reason]
 def _find_apart(evidence: ModelEvidence) -> tuple[list[str], str]:
     """Return the images that stand apart, and a clause on how many ({}) do."""
     loose, second = [group.images for group in evidence.untied if group.is_loose], evidence.opinion
-    groups = [*(seam.images for seam in evidence.seams), *loose]
+    groups = [*(seam.images for seam in evidence.seams if not seam.is_rival), *loose]
     if len(second.wrong) + len(second.undecided) > 1:  # which tell where seams run
         groups = [g if second.has_most_alike(g) else _without(g, second.alike) for g in groups]
     if len(second.wrong) > 1:

@@ -13,6 +13,10 @@ Pairs of repeated structure contradict in numbers, too. A cut is a seam
              the group. Where they agree on none, the rotations are right and the group is shifted or scaled,
              but moving things make pairs say so, too
 
+A contradiction whose matches fit no pose says nothing of a turn. Where those that agree on it are not twice
+as many as the pairs that agree with the model, repeated structure explains them as well: houses that look
+alike make such pairs between cameras that are right. The turn is a rival then, and is to be looked at.
+
 castle-P19 and P30 have a cut from repeated walls, with 48 and 103 contradictions of which hardly any agree
 on a turn; at lego100, five cameras whose contradictions do are wrong. `scripts/results/verdict.md` has groups
 that were moved: most are named, but those that are merely scaled by a tenth, which few pairs contradict.
@@ -62,16 +66,19 @@ class GroupApart(CameraGroup):
 
     num_turned: Annotated[int, "Contradicting pairs that agree on one turn of the group."]
     turn_deg: Annotated[float | None, "Angle of that turn; null without any."]
+    is_rival: bool = False
+    """Whether the pairs of that turn do not outnumber those that agree, which tie it to the rest."""
 
     @property
     def statement(self) -> str:
         """The same in a sentence."""
         turns = self.num_turned if (self.turn_deg or 0.0) >= 0.5 else 0
         turn = f"; {turns} agree on a turn by {self.turn_deg:.0f} deg" if turns else ""
+        stand, or_else = ("may stand", ", or look alike from there") if self.is_rival else ("stand", "")
         return (
-            f"{len(self.images)} cameras stand apart from the rest ({first_of(self.images)}): "
+            f"{len(self.images)} cameras {stand} apart from the rest ({first_of(self.images)}): "
             f"{counted(self.num_agreeing, 'pair')} between them and the rest agree, {self.num_contradicting} "
-            f"contradict{turn}; either side may be the wrong one"
+            f"contradict or are rejected{turn}; either side may be the wrong one{or_else}"
         )
 
 
@@ -112,8 +119,9 @@ def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, images: Image
     seams = []
     for cut in cuts:
         rows = np.flatnonzero(is_among(sound.pairs, cut.contradicting))
-        taken = min(len(rows), MOST_COMPARED)
-        rows = rows[np.arange(taken) * len(rows) // max(taken, 1)]
+        num_sound = len(rows)
+        taken = min(num_sound, MOST_COMPARED)
+        rows = rows[np.arange(taken) * num_sound // max(taken, 1)]
         turns = _turns(sound.subset(rows), images.rotations, cut.cameras)
         num_turned, turn_deg = _most_alike(turns)
         is_turned = num_turned >= FEWEST_ALIKE and num_turned > LOCAL_SHARE * len(rows)
@@ -125,6 +133,7 @@ def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, images: Image
                     num_contradicting=len(cut.contradicting),
                     num_turned=num_turned,
                     turn_deg=turn_deg,
+                    is_rival=cut.is_tied and num_turned * num_sound < OUTNUMBERED * cut.num_agreeing * taken,
                 )
             )
     return tuple(seams)

@@ -63,7 +63,7 @@ class UntiedGroup(CameraGroup):
         """The same in a sentence."""
         does = "says" if self.is_loose else "checks"
         agree = f"{counted(self.num_agreeing, 'pair')} and {counted(self.num_points, 'point')}"
-        against = f"{counted(self.num_contradicting, 'pair')} contradict"
+        against = f"{counted(self.num_contradicting, 'pair')} contradict or are rejected"
         return (
             f"nothing {does} where {are(self.images)} relative to the rest: {agree} between them agree, "
             f"{against}; match more images across"

@@ -62,7 +62,7 @@ def gather_evidence(
     if cuts:  # which are seams by the rotations that pairs across have by themselves
         across = np.concatenate([cut.contradicting for cut in cuts])
         seams = find_seams(cuts, ask_rotations(source, across, threads), source.images)
-    apart = frozenset(name for seam in seams for name in seam.images)
+    apart = frozenset(name for seam in seams if not seam.is_rival for name in seam.images)
     contradictions, places = fits.contradicted(images), fits.other_places(images.names)
     asked_of = [*contradictions, *(() if source.has_database else (one.image for one in places))]
     # Own tracks hold no second place of who fits the first.

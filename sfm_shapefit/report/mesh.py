@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.base.geometry import FLOAT32_REACH, median_spread
 from sfm_shapefit.report.drawing import Drawing, frustum_corners
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 Colors = npt.NDArray[np.uint8]
 
-_FLOAT32 = 2.0**-24  # share of a coordinate; what rounding to 32 bits moves it by at most
-_FINE_ENOUGH = 1e-6  # share of the spread of vertices; hundredths of a pixel in a picture of the scene
 _TRUST_STOPS = np.array([0.0, 0.4, 0.7, 1.0])  # trusts that have a color; others lie between
 _TRUST_COLORS = np.array([[179, 32, 44], [232, 116, 59], [233, 197, 74], [42, 157, 143]], dtype=np.float64)
 """Red, green and blue from 0 to 255 at each of these; the page has the same."""
@@ -48,7 +46,7 @@ def ply_bytes(
     """
     largest = np.abs(vertices).max(initial=0.0)
     if len(vertices):
-        fine |= bool(largest * _FLOAT32 > _FINE_ENOUGH * median_spread(vertices))
+        fine |= bool(largest > FLOAT32_REACH * median_spread(vertices))
         fine |= bool(largest > np.finfo(np.float32).max)
     kind, name = ("<f8", "double") if fine else ("<f4", "float")
     axes = ["x", "y", "z", *(["nx", "ny", "nz"] if with_normals else [])]

@@ -8,6 +8,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
 from sfm_shapefit.base.geometry import principal_lengths
 from sfm_shapefit.base.record import Record
+from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.scene.known_positions import KnownPositions
 
 
@@ -75,6 +76,8 @@ class Marks:
     """(m, 2)"""
     statement: str
     """Where they come from, and what their axes are."""
+    absent: tuple[str, ...] = ()
+    """Images that the list names and the model lacks."""
 
     def of(self, images: IntArray) -> Self:
         """Return them with the marks in some images (n,), ascending, numbered by their place among these."""
@@ -105,7 +108,9 @@ class ControlPoints(Marks):
     def why_too_few(self) -> str:
         """Return why the points cannot set scale and axes, a clause; empty if they can."""
         usable = self.seen_twice() & ~self.is_check
-        return why_too_few(self.positions[usable], "have marks in two images of the model")
+        why = why_too_few(self.positions[usable], "have marks in two images of the model")
+        lacking = f"; the model has no {first_of(self.absent)}" if self.absent else ""
+        return f"{why}{lacking}" if why else ""
 
 
 def why_too_few(positions: FloatArray, what: str) -> str:

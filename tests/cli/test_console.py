@@ -16,7 +16,7 @@ import pycolmap
 import pytest
 
 from sfm_shapefit import check, locate, map_database
-from sfm_shapefit.base.display import Row, Telling
+from sfm_shapefit.base.display import NextStep, Row, Telling
 from sfm_shapefit.base.kernel_cache import counted_as_compiling, measure_compilation
 from sfm_shapefit.cli import console
 from sfm_shapefit.cli.flags import OutputFlags
@@ -257,17 +257,19 @@ def test_json_means_the_same_on_any_stdout(monkeypatch, encoding):
 def test_a_color_terminal_shows_warnings_and_verdict_in_color_unless_no_color_is_wanted(monkeypatch):
     def show():
         console.print_answer(Telling(["8 of 8"], [Row("warning", ["look out"])]), "3.0 s")
-        console.print_ending("look", "look at 1 camera (a.jpg)", "written to out/", "colmap")
+        console.print_ending(
+            "look", "look at 1 camera (a.jpg)", "written to out/", NextStep("", "colmap", "later")
+        )
 
     shown = partial(shown_on, Terminal, monkeypatch, show, TERM="xterm-256color")
     colored = shown()
     assert "8 of 8        3.0 s\n" in colored
     assert "\x1b[1;33mwarning: look out\x1b[0m" in colored
     assert "\x1b[1;33mverdict: look at 1 camera (a.jpg)" in colored
-    assert colored.endswith("written to out/\nnext: colmap\n")
+    assert colored.endswith("written to out/\nnext, later: colmap\n")
     assert "33m" not in shown(NO_COLOR="1")
     narrow = re.sub("\x1b\\[[0-9]*m", "", shown(COLUMNS="20", NO_COLOR="1"))
-    assert narrow.endswith("look at 1 \ncamera (a.jpg)\nwritten to out/\nnext: colmap\n")
+    assert narrow.endswith("look at 1 \ncamera (a.jpg)\nwritten to out/\nnext, later: colmap\n")
 
 
 def test_a_terminal_of_eighty_columns_has_a_usual_first_line_whole_and_never_breaks_a_command(monkeypatch):
@@ -278,7 +280,7 @@ def test_a_terminal_of_eighty_columns_has_a_usual_first_line_whole_and_never_bre
 
     def show():
         console.print_answer(Telling([first]), "29.9 s")
-        console.print_ending("good", "good", "written to out/", step)
+        console.print_ending("good", "good", "written to out/", NextStep("", step))
 
     lines = shown_on(Terminal, monkeypatch, show, COLUMNS="80", TERM="xterm").splitlines()
     assert lines[0] == f"{first}    29.9 s"

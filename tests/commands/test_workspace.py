@@ -292,6 +292,49 @@ def test_a_model_placed_on_earth_keeps_its_axes(tmp_path):
         np.testing.assert_array_equal(point.xyz, sky.model.point3D(k).xyz)
 
 
+def test_a_model_far_from_its_origin_is_written_near_it_and_the_offset_is_told(tmp_path):
+    """UTM: float32 has steps of half a meter there, in a scene of 40 m."""
+    utm = np.array([690006.296, 5330000.243, 523.4])
+    sky = draw_sky(tmp_path, ["radial"], np.eye(3), roll_deg=1.0)
+    centers = {image.name: image.projection_center() for image in sky.model.images.values()}
+    points = {k: point.xyz.copy() for k, point in sky.model.points3D.items()}
+    sky.model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), utm))
+    (tmp_path / "model").mkdir()
+    sky.model.write(tmp_path / "model")
+    out = tmp_path / "out"
+    said = run("workspace", tmp_path / "model", sky.images, out, code=0).stdout
+    offset = np.array([float(word) for word in (out / "offset.xyz").read_text().split()])
+    np.testing.assert_array_equal(offset, [690000.0, 5330000.0, 500.0])
+    assert "offset: 690000.0 5330000.0 500.0, subtracted from all coordinates, see offset.xyz" in said
+    made = pycolmap.Reconstruction(out / "sparse/0")
+    for image in made.images.values():
+        np.testing.assert_allclose(image.projection_center() + offset, centers[image.name] + utm, atol=1e-6)
+    assert b"property float x" in (out / "sparse/0/points3D.ply").read_bytes()
+    xyz = [points[k] + (utm - offset) for k in sorted(made.points3D)]
+    np.testing.assert_allclose(trimesh.load(out / "sparse/0/points3D.ply").vertices, xyz, atol=1e-5)
+    for frame in json.loads((out / "transforms.json").read_text())["frames"]:
+        center = made.find_image_with_name(Path(frame["file_path"]).name).projection_center()
+        np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], center, atol=1e-9)
+    kept = sfm_shapefit.workspace(tmp_path / "model", sky.images, tmp_path / "kept", offset="0,0,0")
+    np.testing.assert_allclose(
+        kept.reconstruction.point3D(min(points)).xyz, sky.model.point3D(min(points)).xyz
+    )
+    assert not (tmp_path / "kept/offset.xyz").exists()
+    with pytest.raises(InputError, match="the offset must be auto, or three numbers"):
+        sfm_shapefit.workspace(tmp_path / "model", sky.images, tmp_path / "no", offset="far")
+    nerf = tmp_path / "t.json"
+    assert "float32; give --offset auto" in run("convert", tmp_path / "model", nerf, code=0).stdout
+
+
+def test_an_offset_is_near_enough_for_a_small_scene(tmp_path):
+    sky = draw_sky(tmp_path, ["pinhole"], np.eye(3))
+    sky.model.transform(pycolmap.Sim3d(1e-3, pycolmap.Rotation3d(), np.array([10.0, -20.049, 0.0])))
+    made = sfm_shapefit.workspace(sky.model, sky.images, tmp_path / "out")
+    assert b"property float x" in (tmp_path / "out/sparse/0/points3D.ply").read_bytes()
+    assert made.offset[0] == pytest.approx(10.0, abs=0.05)
+    assert made.offset[1] == pytest.approx(-20.049, abs=0.05)
+
+
 def test_pictures_of_several_folders_are_one_folder_of_pictures_that_can_be_written(tmp_path):
     sky = draw_sky(tmp_path, ["pinhole"], num_frames=3)
     (sky.images / "a").mkdir()

@@ -168,6 +168,14 @@ def test_evidence_that_the_fit_did_not_use_names_cameras_and_lowers_the_grade(fo
     assert verdict.statement == "do not use: 2 of 8 cameras stand apart from the rest"
     verdict = replace(found, evidence=ModelEvidence(seams=(group_apart(*names[1:4]),))).verdict
     assert verdict.reasons == ("3 of 8 cameras stand apart from the rest",)  # and that is said once
+    rival = replace(group_apart(*names[1:4]), is_rival=True)
+    verdict = replace(found, evidence=ModelEvidence(seams=(rival,))).verdict
+    assert (verdict.grade, verdict.cameras) == (Grade.LOOK, names[1:4])
+    assert verdict.reasons == ("3 of 8 cameras may stand apart from the rest",)
+    both = ModelEvidence(seams=(group_apart(*names[2:4]), rival))
+    assert replace(found, evidence=both).verdict.statement == (
+        "do not use: 2 of 8 cameras stand apart from the rest"
+    )
 
 
 def test_a_loose_group_stands_apart_and_an_unchecked_one_is_looked_at(found):

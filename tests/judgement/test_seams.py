@@ -10,6 +10,7 @@ from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.seams import find_cuts, find_seams
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.matches import is_among
 from tests.problems import made_rotations
 
 N, GROUP = 18, np.array([0, 3, 8, 11, 14, 17])
@@ -81,13 +82,25 @@ def test_a_tied_group_is_a_seam_if_contradictions_agree_on_one_turn(rotations):
     turn = Rotation.from_rotvec([0.0, 0.0, np.radians(90.0)]).as_matrix()
     images = turned_to(rotations)
     (seam,) = find_seams((cut,), rotations_of(EVERY, rotations, turn), images)
-    assert (seam.num_turned, round(seam.turn_deg, 6)) == (60, 90.0)
+    assert (seam.num_turned, round(seam.turn_deg, 6), seam.is_rival) == (60, 90.0, False)
     random = rotations_of(EVERY, rotations, at_random=True)
     assert find_seams((cut,), random, images) == ()
     few = random.rotations.copy()
     rows = np.flatnonzero([pair in cut.contradicting.tolist() for pair in EVERY.tolist()])[:6]
     few[rows] = rotations_of(EVERY, rotations, turn).rotations[rows]
     assert find_seams((cut,), replace(random, rotations=few), images) == ()  # 6 of 60 are chance
+
+
+def test_a_turn_that_hardly_more_pairs_ask_for_than_agree_is_a_rival_as_alike_houses_make_it(rotations):
+    """Contradictions whose matches fit no pose outnumber those that agree, and say nothing of the turn."""
+    (cut,) = cut_of(*split(12))
+    turn = Rotation.from_rotvec([0.0, 0.0, np.radians(90.0)]).as_matrix()
+    every = rotations_of(EVERY, rotations, turn)
+    across = np.flatnonzero(is_among(EVERY, cut.contradicting))
+    for sound, is_rival in ((across[:23], True), (across[:24], False)):
+        (seam,) = find_seams((cut,), every.subset(sound), turned_to(rotations))
+        assert (seam.num_turned, seam.num_contradicting, seam.is_rival) == (len(sound), 60, is_rival)
+        assert ("may stand apart" in seam.statement) == is_rival
 
 
 def test_a_group_without_a_turn_is_a_seam_if_it_is_tied_to_nothing_that_most_of_the_rest_is_in(rotations):

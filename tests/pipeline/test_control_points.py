@@ -1,14 +1,17 @@
 """Ground control points set scale, origin and axes; what is wrong with them is said."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pycolmap
 import pytest
+from typer.testing import CliRunner
 
 import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
+from sfm_shapefit.cli import app
 from sfm_shapefit.files.colmap.control_points import read_control_points
 from sfm_shapefit.files.colmap.known import read_known
 from sfm_shapefit.files.colmap.model import read_model
@@ -144,6 +147,53 @@ def test_coordinates_on_earth_become_east_north_and_up_of_their_median(ring, tmp
     np.testing.assert_allclose(apart, CORNERS - CORNERS[0], atol=1e-6)  # a nanometer of UTM's series
 
 
+def test_evaluate_maps_a_finished_model_onto_control_points_and_tells_both_errors(ring, tmp_path):
+    moved = CORNERS + np.array([[0, 0, 0]] * 4 + [[0, 0, 0.4], [0, 0, 0], [0.12, 0, 0]])
+    lines = marks_of(ring, CORNERS, lambda _: WORLD.apply(moved))
+    lines = [f"{line} check" if line.endswith((" P5", " P6")) else line for line in lines]
+    command = ["evaluate", str(RING / "sparse" / "0"), "--control-points", written(tmp_path, lines)]
+    told = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
+    compared = told["control_points"]
+    assert compared["control_rms"] < 1e-4  # pixels are exact
+    assert compared["check_rms"] == pytest.approx(2.5 * 0.12 / np.sqrt(2.0), rel=1e-3)
+    assert compared["points_from_model"]["scale"] == pytest.approx(2.5, rel=1e-4)
+    np.testing.assert_allclose(compared["points_from_model"]["rotation"], TURN, atol=1e-4)
+    assert [row["use"] for row in compared["points"]] == ["control"] * 4 + ["unused", "check", "check"]
+    assert told["warnings"][-1].startswith(
+        "1 control point contradicts the others and sets nothing: P4, 1 off"
+    )
+    said = " ".join(CliRunner().invoke(app, command).stdout.replace("│", " ").split())
+    assert "4 control points off by" in said
+    assert "2 check points off by 0.212 (root mean square), P6 most, by 0.3; 1 not used" in said
+    assert "after a similarity onto 4 control points: scale 2.5, turned by 21.4 deg, moved by" in said
+    with_reference = CliRunner().invoke(app, [*command[:2], *command[1:]])
+    assert with_reference.exit_code == 2
+
+
+def test_evaluate_compares_a_model_as_it_stands_with_fewer_than_three_control_points(ring, tmp_path):
+    shifted = CORNERS[:4] + np.array([[0.3, 0, 0]] + [[0, 0, 0]] * 3)
+    lines = marks_of(ring, CORNERS[:4], lambda _: shifted)
+    path = written(tmp_path, [line if line.endswith(("P0", "P1")) else f"{line} check" for line in lines])
+    compared = sfm_shapefit.evaluate_lengths(ring, control_points=path).control_points
+    assert compared.points_from_model is None
+    assert compared.check_rms == pytest.approx(0.15, abs=1e-4)
+    assert "as the model stands: 2 of the control points can be triangulated" in compared.statement
+    on_a_map = written(tmp_path, lines[:16], "EPSG:4326")
+    with pytest.raises(InputError, match="the model does not say where on Earth it is, so it cannot be comp"):
+        sfm_shapefit.evaluate_lengths(ring, control_points=on_a_map)
+
+
+def test_evaluate_compares_points_on_earth_with_a_model_placed_by_others(ring, tmp_path):
+    """The medians of the points differ by 15 cm, and so do the origins of the axes east, north and up."""
+    path = written(tmp_path, marks_of(ring, CORNERS, in_utm), "WGS84 UTM 32N")
+    found = sfm_shapefit.locate(ring, RING / "database.db", control_points=path)
+    path = written(tmp_path, marks_of(ring, CORNERS[4:], in_utm)[:16], "WGS84 UTM 32N")
+    compared = sfm_shapefit.evaluate_lengths(found, control_points=path).control_points
+    assert compared.points_from_model is None
+    assert [row.use for row in compared.points] == ["check"] * 2
+    assert compared.check_rms < 1e-3
+
+
 def test_points_on_both_sides_of_longitude_180_are_near_their_datum(ring, tmp_path):
     transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     geodetic = np.asarray(transform.enu_to_ellipsoid(CORNERS, -16.8, 180.0, 5.0))
@@ -190,6 +240,11 @@ TWICE = [line(k, image) for k in range(4) for image in ("0001.jpg", "0002.jpg")]
             "2 of the control points have marks in two images of the model, and scale and axes",
         ),
         ("local", TWICE[::2], "0 of the control points have marks in two images"),
+        (
+            "local",
+            [line.replace("0002.jpg", "9999.jpg") for line in TWICE],
+            "in two images of the model, and scale and axes need three; the model has no 9999.jpg",
+        ),
         ("local", [line.replace("P3", "CHK-3").replace("P2", "CHK-2") for line in TWICE], "2 of the control"),
         (
             "local",

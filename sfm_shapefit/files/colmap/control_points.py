@@ -62,6 +62,7 @@ def read_control_points(path: Path, images: Images) -> ControlPoints:
         images=known.images,
         pixels=known.pixels,
         statement=f"{len(known.names)} points of {path}{of}{known.statement}",
+        absent=known.absent,
         datum=datum,
     )
 

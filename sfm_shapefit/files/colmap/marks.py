@@ -12,6 +12,7 @@ import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import tangent_bases
+from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.position_table import LARGEST
 from sfm_shapefit.files.lines import is_number, text_of
@@ -101,13 +102,15 @@ def marks_in(
     names = points or sorted({point for point, _ in used})
     place = {name: k for k, name in enumerate(names)}
     used.sort(key=lambda one: (place[one[0]], index_of[one[1].image]))
-    lost = len(marks) - len(used)
+    lost, absent = len(marks) - len(used), tuple(name for name in named if name not in index_of)
+    lacking = f", without {lost} of {len(marks)} marks, whose images the model lacks ({first_of(absent)})"
     known = Marks(
         names=tuple(names),
         points=np.array([place[point] for point, _ in used], dtype=np.int64),
         images=np.array([index_of[mark.image] for _, mark in used], dtype=np.int64),
         pixels=np.array([mark.pixel for _, mark in used]),
-        statement=f", without {lost} of {len(marks)} marks, whose images the model lacks" if lost else "",
+        statement=lacking if lost else "",
+        absent=absent,
     )
     return known, dict(reversed(used))
 

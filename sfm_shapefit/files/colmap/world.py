@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import Similarity, nearest_rotations
+from sfm_shapefit.base.geometry import FLOAT32_REACH, Similarity, median_spread, nearest_rotations
 from sfm_shapefit.files.colmap.earth import epsg_code, to_epsg
 from sfm_shapefit.files.lines import is_number
 from sfm_shapefit.scene.given import EarthDatum
@@ -19,7 +19,7 @@ from sfm_shapefit.scene.images import Images
 
 _STEP = 100.0  # meters, half the distance over which turn and scale are measured; the error is below 1e-9
 _LARGEST = 1e9  # units; larger offsets would swallow the digits of coordinates
-_ROUND = 100.0  # units; offsets that are found are multiples of it, as surveyors choose them
+_LEAST_DECIMALS = -2  # digits; offsets that are found are multiples of 100 units, as surveyors choose them
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,7 +96,8 @@ def world_of(datum: EarthDatum | None, centers: FloatArray, crs: str, offset: st
         datum: that of the model; None without.
         centers: (k, 3) of its cameras.
         crs: a system as of `epsg_code`; empty for the model's own axes.
-        offset: three numbers with commas between them, or auto: the cameras' middle in round numbers.
+        offset: three numbers with commas between them, or auto: the cameras' middle in round numbers, near
+            enough for float32.
 
     Raises:
         InputError: if nothing says where on Earth the model stands, or `crs` or `offset` is none.
@@ -110,11 +111,38 @@ def world_of(datum: EarthDatum | None, centers: FloatArray, crs: str, offset: st
             )
         world = World(datum=datum, code=epsg_code(crs, datum))
     if offset == "auto":
-        middle = np.median(world.places(centers), axis=0)
-        x, y, z = (_ROUND * np.round(middle / _ROUND)).tolist()
+        x, y, z = _round_middle(world.places(centers))
     elif offset:
         words = offset.replace(",", " ").split()
         if len(words) != 3 or not all(is_number(word) and abs(float(word)) < _LARGEST for word in words):
             raise InputError(f"the offset must be auto, or three numbers as 481300,5782900,0; got {offset!r}")
         x, y, z = map(float, words)
     return replace(world, offset=(x, y, z)) if offset else world
+
+
+def float32_world(places: FloatArray, offset: str) -> World:
+    """Return the world of a model for programs that read float32: its own, or with an offset.
+
+    Args:
+        places: (k, 3) of its cameras and points.
+        offset: three numbers, or auto: one that is found where float32 is too coarse, else none.
+
+    Raises:
+        InputError: if `offset` is none.
+    """
+    return World() if offset == "auto" and not is_too_far(places) else world_of(None, places, "", offset)
+
+
+def _round_middle(places: FloatArray) -> list[float]:
+    """Return the median of places (k, 3), rounded to hundreds or, in a smaller scene, as float32 needs."""
+    spread, decimals = median_spread(places), _LEAST_DECIMALS
+    if spread > 0.0:
+        decimals = max(decimals, int(np.ceil(-np.log10(FLOAT32_REACH * spread))))
+    rounded: list[float] = (np.round(np.median(places, axis=0), decimals) + 0.0).tolist()
+    return rounded
+
+
+def is_too_far(places: FloatArray) -> bool:
+    """Return whether places (k, 3) are so far from the origin that float32 is too coarse for their scene."""
+    spread = median_spread(places)
+    return 0.0 < FLOAT32_REACH * spread < float(np.abs(np.median(places, axis=0)).max())
