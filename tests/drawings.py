@@ -133,7 +133,7 @@ def _facts(names):
             pair_error_px=1.4,
             sigma=0.015,
             sigma_of_extent=0.0007,
-            sigma_unit="of the input's units",
+            sigma_unit="in the input's units",
         ),
         num_pairs=120,
         num_pairs_rejected=18,

@@ -11,6 +11,11 @@ OF_DATABASE = "database"
 SOLVED = "solved"
 """In place of a file of names of images: those that observe a 3D point."""
 MASKS = "that of the masks, NAME.png for image NAME"
+PICTURES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+"""Suffixes of the images that pycolmap reads."""
+VIDEOS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".insv", ".360"})
+TAKE_FRAMES = "take frames, as with `ffmpeg -i VIDEO -vf fps=2 -qscale:v 2 FRAMES/%05d.jpg`, and map FRAMES"
+"""What to do with a video."""
 
 
 def refuse_irregular_file(path: Path) -> None:

@@ -204,6 +204,14 @@ _KINDS: dict[Any, tuple[type, ...]] = {
     tuple: (tuple, list),
     Path: (Path,),
 }
+_NAMES: dict[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    bool: "true or false",
+    tuple: "a list",
+    Path: "a path",
+}
 
 
 def _fits(value: object, kind: Any) -> bool:
@@ -225,4 +233,5 @@ def _wanted(kind: Any) -> str:
         return f"one of {', '.join(get_args(kind))}"
     if get_origin(kind) in (Union, types.UnionType):
         return " or ".join(_wanted(choice) for choice in get_args(kind) if choice is not type(None))
-    return "a number" if kind is float else f"of type {(get_origin(kind) or kind).__name__}"
+    kind = get_origin(kind) or kind
+    return _NAMES.get(kind) or f"of type {kind.__name__}"

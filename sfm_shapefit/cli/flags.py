@@ -110,8 +110,9 @@ _FIRST_SCREEN = {
         *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
     ),
     "map": (
-        *("priors", "control_points", "known_distance", "gravity", "without", "min_model_size", "join"),
-        *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
+        *("camera_model", "camera_mode", "pairing", "mask_path", "rig_config_path"),
+        *("priors", "control_points", "known_distance", "intrinsics", "adjust"),
+        *("images", "overwrite", "json", "threads"),
     ),
     "join": ("database", "adjust", "without", "images", "overwrite", "json"),
     "synth": (
@@ -355,7 +356,9 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
     try:
         return settings(**in_file | flags)
     except (TypeError, ValueError) as error:
-        message = f"{config}: {error}" if _is_wrong_alone(settings, in_file, str(error)) else str(error)
+        message = str(error)
+        if config and _is_wrong_alone(settings, in_file, message):
+            message = f"{_place_of(message, config)}: {message}"
         for name in flags:  # an option of the file keeps its spelling
             message = re.sub(rf"\b{name}(?=[ =])", _flag_of(name), message)
             message = message.replace(f"{_flag_of(name)}=", f"{_flag_of(name)} ")
@@ -384,17 +387,29 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
     homes = homes_of(settings)
     known = {*homes, *homes.values()}
     try:
-        read = tomllib.loads(text)
+        read = tomllib.loads(f"{text}\n")  # errors of the last line are told by its number, too
     except (ValueError, RecursionError) as error:
         if answer := answer_for_file(_names_in_ini(text), flags_and_keys()):
             raise typer.BadParameter(f"{path} {answer}") from error
-        raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
+        said = str(error).replace("Cannot overwrite a value", "a key is given for the second time")
+        raise typer.BadParameter(f"{path} is not a readable TOML file: {said}") from error
     unknown = [name for name in read if name not in known]
     if unknown and (answer := answer_for_file(_names_in(read, unknown), flags_and_keys())):
         raise typer.BadParameter(f"{path} {answer}")
     for name in unknown:
         raise typer.BadParameter(f"{path}: {name!r} {_describe_unknown(name, sorted(known))}")
     return read
+
+
+def _place_of(message: str, path: Path) -> str:
+    """Return a TOML file, and the line of the option that a message begins with, if it has one."""
+    from sfm_shapefit.files.lines import text_of
+
+    name = re.match(r"\w*", message)
+    key = re.compile(rf"\s*{name and name.group()}\s*=")
+    numbers = (number for number, line in enumerate(text_of(path).split("\n"), 1) if key.match(line))
+    number = next(numbers, None)
+    return f"{path}, line {number}" if number else str(path)
 
 
 def _names_in(read: dict[str, Any], chosen: Iterable[str]) -> Iterator[str]:

@@ -115,7 +115,7 @@ class Course:
     @property
     def title(self) -> str:
         """The stage, with its number where the plan has it."""
-        number = f"{self.position + 1} of {len(self.plan)} " if self.stage in self.plan else ""
+        number = f"stage {self.position + 1} of {len(self.plan)}, " if self.stage in self.plan else ""
         return f"{number}{self.stage}"
 
     @property

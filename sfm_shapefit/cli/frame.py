@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     Result = LocateResult | MapResult | GraphResult | JoinedModel
 
-_BLACK = "the points have none; --images FOLDER gives them those of the images"
+_BLACK = "the points have none; --images FOLDER takes them from the images"
 _IN_PLACE_OF_FILES = {OF_DATABASE, SOLVED}
 """Words that options take where else they take a file."""
 _NOTICED_S = 1.0  # seconds; a user does not notice less compiling

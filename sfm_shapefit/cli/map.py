@@ -1,5 +1,6 @@
 """`sfm-shapefit map DATABASE OUT`, and `map IMAGES OUT`, which makes the database first."""
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -52,7 +53,8 @@ def map_command(
     database: Annotated[
         Path | None,
         typer.Argument(
-            metavar="DATABASE", help="COLMAP database with verified matches, or a folder of images to match."
+            metavar="DATABASE|IMAGES",
+            help="COLMAP database with verified matches, or a folder of images to match.",
         ),
     ] = None,
     out: OutArgument = None,
@@ -65,8 +67,7 @@ def map_command(
 ) -> None:
     """Make models from the matches of DATABASE; write them to OUT/0, OUT/1, ..., the largest first.
 
-    Where DATABASE is a folder of images, OUT/database.db is made of them first, by COLMAP's features and
-    matcher.
+    From a folder IMAGES, OUT/database.db is made first, by COLMAP's features and matcher.
     """
     source = one_path(database, database_path, "DATABASE")
     target = one_path(out, output_path, "OUT")
@@ -75,13 +76,15 @@ def map_command(
         from sfm_shapefit.commands.map import map_database
         from sfm_shapefit.pipeline.execution import open_client
 
-        if made is not None:
-            _match(source, made, given, run)
+        notes = _match(source, made, given, run) if made is not None else []
+        if made is None and run.flags.images:
+            _refuse_other_images(Path(run.flags.images), source)
         with open_client(scheduler) as client:
             found = map_database(
                 made or source, run.options, progress=run.progress, priors=priors, client=client
             )
-        run.finish(found if made is None else replace(found, images=source), source, target)
+        found = replace(found, images=made and source, warnings=(*notes, *found.warnings))
+        run.finish(found, source, target)
 
 
 def _database_to_make(source: Path, target: Path, given: dict[str, Any]) -> Path | None:
@@ -98,11 +101,27 @@ def _database_to_make(source: Path, target: Path, given: dict[str, Any]) -> Path
     return None
 
 
-def _match(images: Path, database: Path, given: dict[str, Any], run: Run[MapOptions]) -> None:
-    """Make the database, and let the report have the images."""
-    from sfm_shapefit.commands.match import match_images
+def _match(images: Path, database: Path, given: dict[str, Any], run: Run[MapOptions]) -> list[str]:
+    """Make the database, let the report have the images, and return what the user should know."""
+    from sfm_shapefit.base.clock import Clock
+    from sfm_shapefit.commands.match import make_database
 
-    matching = read_options(MatchingOptions, given)
-    threads = run.options.placement.solver.threads
-    match_images(images, database, options=matching, threads=threads, progress=run.progress)
+    clock = Clock.of(run.progress, run.options.placement.solver.threads)
+    notes = make_database(images, database, read_options(MatchingOptions, given), clock)
     run.flags = replace(run.flags, images=run.flags.images or str(images))
+    return notes
+
+
+def _refuse_other_images(folder: Path, database: Path) -> None:
+    """Refuse a folder without any image of the database now, not when all is computed."""
+    from sfm_shapefit.base.errors import InputError
+    from sfm_shapefit.base.paths import file_of
+    from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
+
+    with closing(DatabaseFile(database_in(database))) as file:
+        names = [str(name) for (name,) in file.rows("images", {("name",): "SELECT name FROM images"})]
+    if names and not any(file_of(folder, name) for name in names):
+        raise InputError(
+            f"{folder} holds no image of {database}, such as {names[0]}; give the folder that their names "
+            "start from"
+        )

@@ -67,7 +67,7 @@ def locate(
             with the same answer to the bit. None: all is done here.
 
     Returns:
-        `reconstruction`, the seeded model: cameras placed, points triangulated, all else unregistered;
+        `reconstruction`, the model: cameras that are placed, and the points that they triangulate;
         `cameras` and `pairs`, a row each with trust, standard deviation, residual and verdict; `certified`,
         the optimum with its certificate; `warnings`, a sentence each; `gauge`, `further` pieces, `timings_s`.
 

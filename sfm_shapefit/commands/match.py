@@ -4,6 +4,7 @@ images and lenses -> features -> pairs -> matches and two-view geometries
 """
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -58,17 +59,26 @@ def match_images(
 
     Raises:
         InputError: if there are no two images that can be read, or the database is of other images.
+
+    Warns:
+        UserWarning: if photographs or videos in the folder cannot be read.
     """
     options = merge_options(options, MatchingOptions, overrides)
     clock = Clock.of(progress, SolverOptions(threads=threads).threads)
-    folder, path = Path(images), Path(database)
+    for note in make_database(Path(images), Path(database), options, clock):
+        warnings.warn(note, stacklevel=2)
+    return Path(database)
+
+
+def make_database(folder: Path, path: Path, options: MatchingOptions, clock: Clock) -> list[str]:
+    """Do what `match_images` does; return what the user should know, a sentence each."""
     refuse_lens(options)
     if options.mask_path:
         refuse_no_folder(Path(options.mask_path), MASKS)
     found = find_photographs(folder)
-    refuse_rigs(options, found)
+    refuse_rigs(options, found.names)
     made = PhotographDatabase(
-        folder=folder, database=path, names=found, options=options, threads=clock.threads
+        folder=folder, database=path, names=found.names, options=options, threads=clock.threads
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     _remember(path, options)
@@ -83,7 +93,8 @@ def match_images(
         made.detect(clock.advance)
     with clock("matches"):
         _match(made, _pairing_of(names, options), clock)
-    return path
+    unused = [*found.unread, *unreadable]
+    return [f"not used, since pycolmap cannot read them: {first_of(unused)} in {folder}"] if unused else []
 
 
 def _record_of(database: Path) -> Path:

@@ -2,9 +2,10 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Alignment, Similarity, rotation_angles_deg
@@ -43,7 +44,7 @@ class ControlPoint(Record):
         """Name, use, error and its axes, pixels and marks, as the report has them in a row."""
         return [
             self.name,
-            self.use,
+            said_use(self.use, found=self.error is not None),
             "" if self.error is None else f"{self.error:.3g}",
             ", ".join(f"{value:.3g}" for value in self.residual or ()),
             "" if self.error_px is None else f"{self.error_px:.2g}",
@@ -59,6 +60,28 @@ class ControlComparison(Record):
     control_rms: Annotated[float | None, "Root mean square of the errors of control points; null if none."]
     check_rms: Annotated[float | None, "The same of check points."]
     points: Annotated[tuple[ControlPoint, ...], "All points with a mark in the model."]
+
+
+def said_use(use: str, *, found: bool) -> str:
+    """Say what a known point or length is used for, and why it is not, given whether the model has it."""
+    return use if use != "unused" else "not used: contradicts the others" if found else "not used: no place"
+
+
+def control_columns(points: Sequence[ControlPoint]) -> dict[str, npt.NDArray[Any]]:
+    """Return the points as columns by the names of locate.json, a column per axis; NaN where unknown."""
+    nowhere = [np.nan] * 3
+    known = np.array([point.known for point in points], np.float64).reshape(-1, 3).T
+    residual = np.array([point.residual or nowhere for point in points], np.float64).reshape(-1, 3).T
+    return {
+        "name": np.array([point.name for point in points], object),
+        "use": np.array([point.use for point in points], object),
+        **dict(zip(("known_x", "known_y", "known_z"), known, strict=True)),
+        **dict(zip(("residual_x", "residual_y", "residual_z"), residual, strict=True)),
+        "error": np.array([point.error for point in points], np.float64),
+        "error_px": np.array([point.error_px for point in points], np.float64),
+        "num_marks": np.array([point.num_marks for point in points], np.int64),
+        "num_agreeing_marks": np.array([point.num_agreeing_marks for point in points], np.int64),
+    }
 
 
 def control_rows(known: ControlPoints, found: TriangulatedMarks, fit: ControlFit | str) -> list[ControlPoint]:
@@ -97,10 +120,10 @@ def control_warnings(
         errors = np.where(there & ~known.is_check & ~fit.fitting, np.linalg.norm(fit.residuals, axis=1), 0.0)
         if errors.any():
             worst, count = int(np.argmax(errors)), int(np.sum(errors > 0.0))
-            say, most = ("contradicts", "") if count == 1 else ("contradict", " most")
+            say, are, most = ("contradicts", "is", "") if count == 1 else ("contradict", "are", " most")
             yield (
-                f"{counted(count, 'control point')} {say} the others and set{'s' * (count == 1)} nothing: "
-                f"{known.names[worst]}{most}, {errors[worst]:.3g} off; check coordinates and marks"
+                f"{counted(count, 'control point')} {say} the others and {are} not used: "
+                f"{known.names[worst]}{most}, off by {errors[worst]:.3g}; check coordinates and marks"
             )
         lost = np.flatnonzero(~there)
         if len(lost):
@@ -124,10 +147,9 @@ def describe_control_points(rows: Sequence[ControlPoint]) -> str:
     for use, noun in (("control", "control point"), ("check", "check point")):
         own = [row for row in rows if row.use == use and row.error is not None]
         if own:
-            worst = max(own, key=lambda row: row.error or 0.0)
-            off = (
-                f"off by {rms_of(rows, use):.3g} (root mean square), {worst.name} most, by {worst.error:.3g}"
-            )
+            worst, typical = max(own, key=lambda row: row.error or 0.0), rms_of(rows, use)
+            most = f"{worst.name} most, by {worst.error:.3g}"
+            off = f"off by {typical:.3g} in space (root mean square), {most}"
             parts.append(f"{counted(len(own), noun)} {off}")
     unused = sum(row.use == "unused" for row in rows)
     if unused:

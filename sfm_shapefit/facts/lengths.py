@@ -60,7 +60,7 @@ class LengthFacts(Record):
         along = name_direction(np.array(self.worst_direction), has_up=self.has_up)
         worst = f"worst direction {along} (± {self.said(self.worst_half_width)})"
         within = f"± {self.said(self.half_width)} (95 %)"
-        return f"a length of {self.length:g} {self.unit} here is known to {within}, {worst}"
+        return f"a length of {self.length:g} {self.unit} is known to {within}, {worst}"
 
     @property
     def relative(self) -> str:

@@ -15,6 +15,7 @@ from sfm_shapefit.base.display import Row, Telling, Written, row
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted, reasons_by_place
 from sfm_shapefit.facts.command_options import MapOptions
+from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.model import Component, DatabaseInputs, JoinedFacts, MapFacts, next_of_model
 from sfm_shapefit.facts.result import LocateResult
@@ -113,6 +114,11 @@ class MapResult(Written, Tabled):
     def pairs(self) -> Sequence[PairRow]:
         """One row per pair of the largest model that was looked at."""
         return self.models[0].pairs
+
+    @property
+    def control_points(self) -> Sequence[ControlPoint]:
+        """Ground control points as the largest model has them."""
+        return self.models[0].control_points
 
     @property
     def verdict(self) -> ModelVerdict:

@@ -29,17 +29,17 @@ from sfm_shapefit.refinement.starts import Finish
 from sfm_shapefit.solver.solver_options import Solve, Status
 
 UNITS = {
-    "input": "of the input's units",
+    "input": "in the input's units",
     "unit": "units",
-    "rig": "of the rigs' units",
-    "distance": "of the known distance's units",
-    "prior": "of the priors' units",
-    "fixed": "of the fixed cameras' units",
-    "control points": "of the control points' units",
-    "scale bars": "of the scale bars' units",
+    "rig": "in the rigs' units",
+    "distance": "in the known distance's units",
+    "prior": "in the priors' units",
+    "fixed": "in the fixed cameras' units",
+    "control points": "in the control points' units",
+    "scale bars": "in the scale bars' units",
 }
 """Unit of a standard deviation, by the choice of the scale."""
-SOLVER_UNITS = "of the solver's units"
+SOLVER_UNITS = "in the solver's units"
 NOISE_ONLY = "matching noise only"
 """Beginning of a statement that standard deviations leave out errors of rotations and calibration."""
 IN_MEMORY = "in memory"

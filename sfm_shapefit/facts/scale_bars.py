@@ -10,6 +10,7 @@ from sfm_shapefit.adjustment.place_errors import Distances, ScaleErrors, draws_a
 from sfm_shapefit.adjustment.scale_bars import MOST_SIGMAS, BarFit, pooled_noise
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded
+from sfm_shapefit.facts.control_points import said_use
 from sfm_shapefit.files.colmap.marks import look_at_marks
 from sfm_shapefit.placement.control_points import TriangulatedMarks, triangulate_marks
 from sfm_shapefit.scene.given import ScaleBars
@@ -47,7 +48,7 @@ class ScaleBar(Record):
         found = "" if self.found is None else rounded(self.found, digits=6)
         return [
             self.name,
-            self.use,
+            said_use(self.use, found=self.found is not None),
             f"{rounded(self.known, digits=6)} ± {self.known_sigma:.2g}",
             f"{found} ± {self.found_sigma:.2g}" if self.found_sigma is not None else found,
             "" if self.error is None else f"{self.error:+.3g}",

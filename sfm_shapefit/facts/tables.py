@@ -21,6 +21,7 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.atomic_folder import MARKER
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.control_points import control_columns
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.judgement.limits import KNOWN_DEG
 from sfm_shapefit.judgement.reasons import ModelVerdict
@@ -28,7 +29,7 @@ from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.scene.given import EarthDatum
 
-TableName = Literal["cameras", "pairs"]
+TableName = Literal["cameras", "pairs", "control_points"]
 Column = npt.NDArray[Any]
 _BYTE = re.compile(r"\\u(dc[89a-f][0-9a-f])")
 
@@ -324,18 +325,23 @@ def _cells(values: Sequence[object]) -> Sequence[object]:
 
 
 class Tabled:
-    """A result with rows of `cameras` and `pairs`."""
+    """A result with rows of `cameras` and `pairs`, and of `control_points` if it may be brought to some."""
 
     __slots__ = ()
 
-    def table(self, name: TableName) -> dict[str, Column]:
-        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them.
+    def table(self: Any, name: TableName) -> dict[str, Column]:
+        """Return "cameras", "pairs" or "control_points" as columns, arrays by name; pandas takes them.
+
+        Names are those in the CSV; of control points, those in locate.json, a column per axis.
 
         Raises:
             ValueError: if there is no table of this name.
         """
-        if name not in get_args(TableName):
-            raise ValueError(f"there is no table {name!r}; there are 'cameras' and 'pairs'")
+        tables = [one for one in get_args(TableName) if hasattr(self, one)]
+        if name not in tables:
+            raise ValueError(f"there is no table {name!r}, only {', '.join(map(repr, tables))}")
+        if name == "control_points":
+            return control_columns(self.control_points)
         columns = getattr(self, name).flat()
         if name == "cameras":  # where it is none, NaN
             columns["piece"] = columns["piece"].astype(np.float64)

@@ -131,7 +131,7 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Iterator[Reason]:
         if len(unchecked) == 1:
             clause = "nothing checks where one camera is relative to the rest"
         yield of_model(Kind.UNCHECKED, clause, images=unchecked)
-    clause = "evidence at least half as strong puts it elsewhere, or turns it"
+    clause = "another place or rotation of it has at least half as much evidence as this one"
     yield from of_each(Kind.SECOND_OPINION, second.ambiguous, clause)
     if second.has_nothing_in_common:
         yield of_model(Kind.APART, "the model that map makes of the same matches has another shape")

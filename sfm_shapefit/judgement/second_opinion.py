@@ -103,7 +103,7 @@ class SecondOpinion(Record):
             parts.append(f"{are(self.undecided)} elsewhere {by}, and no pairs support either place")
         if self.ambiguous:
             where = f"{are(self.ambiguous)} in the same place {by}"
-            parts.append(f"{where}; evidence at least half as strong puts them elsewhere, or turns them")
+            parts.append(f"{where}, but another place or rotation has at least half as much evidence")
         percent = rounded(100.0 * self.usual, digits=2) if self.usual > _LEAST_TOLD else "less than 0.001"
         usual = f"the median difference of positions is {percent} % of their spread"
         if self.wrong or self.undecided:

@@ -155,7 +155,8 @@ def control_gauge(before: Gauge, control: ControlPoints, fit: ControlFit, *, res
     total = Similarity(scale=motion.scale, rotation=np.eye(3), translation=shift)
     used = int(np.sum(~control.is_check & np.isfinite(fit.residuals[:, 0])))
     sentence = f"the scale is known to {100.0 * fit.scale_sigma:.2g} %"
-    agree = f"{control.statement}; {int(fit.fitting.sum())} of {used} agree, to {fit.sigma:.3g} per axis"
+    agree = f"{control.statement}; {int(fit.fitting.sum())} of {used} agree, "
+    agree += f"with a standard deviation of {fit.sigma:.3g} per axis"
     gauge = replace(
         before,
         similarity=compose(total, before.similarity),

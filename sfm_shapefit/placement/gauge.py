@@ -437,15 +437,16 @@ def _center(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 def _prior_statement(fit: PriorMotion, *, turns: bool) -> str:
     count, agreeing = len(fit.weights), int(np.sum(fit.weights >= 0.5))
-    axes = "axes: the input's"
+    axes = "origin: theirs, axes: the input's"
     if turns:
-        axes = f"turned by {float(rotation_angles_deg(fit.motion.rotation)):.1f} deg onto theirs"
+        turn_deg = float(rotation_angles_deg(fit.motion.rotation))
+        axes = f"origin and axes: theirs, the input was turned by {turn_deg:.1f} deg"
     agree = (
         f"{agreeing} of {count} agree"
         if count >= FEWEST_CHECKED
         else f"{count}, too few to check one another"
     )
-    return f"{agree}, to {fit.level:.3g} per axis; origin: theirs, {axes}"
+    return f"{agree}, with a standard deviation of {fit.level:.3g} per axis; {axes}"
 
 
 def _prior_warning(

@@ -24,6 +24,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, quantile
 from sfm_shapefit.base.record import plain
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.command_options import LocateOptions, MapOptions
+from sfm_shapefit.facts.control_points import describe_control_points
 from sfm_shapefit.facts.model import FactsOfModel, JoinedFacts
 from sfm_shapefit.facts.placed import Facts, GraphFacts, Piece
 from sfm_shapefit.files.colmap.seed import PickedPoints
@@ -118,10 +119,12 @@ def page_data(
 ) -> dict[str, Any]:
     """Return everything that the page shows, as JSON values; cameras and pairs stand worst first."""
     trust = drawing.cameras.trust
-    # Cameras of unknown trust come last; where trust is equal, as it is shown, doubted ones come first.
+    # Cameras of unknown trust come last; where trust is equal, as it is shown, doubted ones come first, then
+    # those whose pairs are off most.
     every = zip(drawing.cameras.names, drawing.cameras.reasons, strict=True)
     is_doubted = np.array([bool(reason) or name in facts.verdict.cameras for name, reason in every], np.bool_)
-    cameras = np.lexsort((~is_doubted, np.round(np.nan_to_num(trust), 2), np.isnan(trust)))
+    errors_deg = np.nan_to_num(drawing.pairs.per_camera(len(trust))[1])
+    cameras = np.lexsort((-errors_deg, ~is_doubted, np.round(np.nan_to_num(trust), 2), np.isnan(trust)))
     pairs = drawing.pairs.worst_first()[:MAX_PAIRS]
     reasons: dict[str, int] = {"": 0}
     rank = np.empty(len(cameras), dtype=np.int64)
@@ -166,7 +169,7 @@ def page_data(
         "reprojection": reprojection_error_bars(drawing.points.errors_px),
         "matrix": view_graph_matrix(drawing.pairs, rank),
         "convergence": _convergence(drawing),
-        "notes": _notes(drawing, residuals_deg),
+        "notes": _notes(drawing, residuals_deg) | {"control": _control_note(facts)},
         "lenses": [[shorten(cell) for cell in lens] for lens in drawing.lenses[:_MAX_ROWS]],
         "fields": [
             {
@@ -384,9 +387,14 @@ def _notes(drawing: Drawing, residuals_deg: Mapping[str, FloatArray]) -> dict[st
         "support": _support_note(drawing),
         "convergence": _convergence_note(drawing),
         "loops": "Pairs far apart in their order are used where the images between agree.",
-        "control": "The position in the model minus the known one; check points do not set scale and axes.",
         "pieces": "Nothing fixes size and place of one piece against another; they share the cameras named.",
     }
+
+
+def _control_note(facts: Facts) -> str:
+    off = shorten(describe_control_points(getattr(facts, "control_points", ())))
+    note = "The position in the model minus the known one; check points do not set scale and axes."
+    return f"{off[:1].upper()}{off[1:]}. {note}"
 
 
 def _trust_note(drawing: Drawing) -> str:

@@ -50,7 +50,7 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
     assert re.fullmatch(
         r"8 of 8 images placed, \d+ points, mean reprojection error 0\.\d\d px +\d.* s.*", placed
     )
-    assert colors == "colors: the points have none; --images FOLDER gives them those of the images"
+    assert colors == "colors: the points have none; --images FOLDER takes them from the images"
     assert matches.endswith("ring8/database.db; 0 of 16 pairs contradict the result; rotations kept")
     assert re.fullmatch(r"positions known to ± \S+ % of the scene", known)
     assert verdict == "verdict: good"
@@ -77,12 +77,14 @@ def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
     lost = replace(facts, figures=replace(facts.figures, sigma_of_extent=1.5))
     assert lost.told((), "").lines[2] == "the uncertainty of positions is not known"
     metric = replace(facts, figures=replace(facts.figures, sigma_unit=UNITS["prior"]))
-    assert metric.told((), "").lines[2].endswith("12 % of the scene (0.5 of the priors' units)")
+    assert metric.told((), "").lines[2].endswith("12 % of the scene (0.5 in the priors' units)")
     assert figures.sigma == pytest.approx(np.median(drawing.cameras.sigmas[drawing.cameras.placed]))
     assert f"± {100 * figures.sigma_of_extent:.2g} % of the scene" in result.stdout
 
 
 def test_a_folder_without_the_images_is_told_and_a_graph_has_no_images_to_show(tmp_path):
+    wrong = ("map", RING / "database.db", tmp_path / "out", "--images", tmp_path)
+    assert "holds no image of" in run_refused(*wrong, code=3)  # before the work
     said = run("locate", RING_MODEL, tmp_path / "out", "--images", tmp_path, code=0).stdout
     assert "lacks 8 of 8 images: is it the right folder?" in " ".join(said.replace("│", " ").split())
     assert "--images" in run("locate", "--help").stdout
@@ -141,7 +143,7 @@ def test_flags_are_understood_with_underscores_too(tmp_path):
 
 def test_what_is_wrong_with_the_input_is_said_before_what_is_wrong_with_the_output(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in ("out/mine", "empty/none.txt", "words.db"):
+    for name in ("out/mine", "empty/none.txt", "words.db", "tour.MP4", "1.jpg"):
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("mine")
     before = fingerprint(tmp_path)
@@ -151,6 +153,8 @@ def test_what_is_wrong_with_the_input_is_said_before_what_is_wrong_with_the_outp
         (f"map {RING_MODEL} out", f"sfm-shapefit locate {RING_MODEL} OUT places its images anew"),
         (f"map {RING_MODEL.parent} out", f"sfm-shapefit locate {RING_MODEL} OUT places its images anew"),
         ("map words.db out", "words.db is not a COLMAP database"),
+        ("map tour.MP4 out", "tour.MP4 is a video; take frames, as with `ffmpeg -i VIDEO"),
+        ("map 1.jpg out", "1.jpg is an image; give the folder of all images"),
         ("map empty out", "empty has no database.db and holds no image"),
         ("locate nosuch out", "nosuch does not exist"),
         (f"locate {RING_MODEL} out --priors nosuch.csv", "nosuch.csv does not exist"),
@@ -315,7 +319,8 @@ def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
 def test_what_is_wrong_in_a_config_file_is_said_with_its_name_and_tables_are_known_too(tmp_path):
     config, flags = tmp_path / "options.toml", ("--config", tmp_path / "options.toml")
     for text, words in (
-        ("min_trust = 'a'", "options.toml: min_trust must be a number"),
+        ("threads = 2\nmin_trust = 'a'", "options.toml, line 2: min_trust must be a number"),
+        ("threads = 2\nthreads = 2", "a key is given for the second time (at line 2"),
         ("[direction]\nmin_inliers = 9", "'direction' is no option; did you mean directions?"),
     ):
         config.write_text(text)

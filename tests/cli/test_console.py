@@ -96,7 +96,7 @@ def test_the_rest_of_a_run_is_what_is_planned_at_the_rate_so_far():
     course.hear("directions", 0, 100_000, now=50.0)
     for done in (25_000, 50_000):
         course.hear("directions", done, 100_000, now=50.0 + 2.0 * 10.02 * done / 100_000)
-    assert course.title == "2 of 4 directions"
+    assert course.title == "stage 2 of 4, directions"
     assert course.counts == "50,000 of 100,000"
     rest = 2.0 * (0.5 * 10.02 + 0.2 + 10.0 + 0.15 + 10.0)
     assert course.rest(60.02) == pytest.approx(rest, rel=1e-9)
@@ -120,7 +120,7 @@ def test_what_nobody_knows_of_a_run_is_not_forecast():
     course.hear("directions", 500, 1000, now=50.0)
     assert course.rest(50.0) == pytest.approx(10.0 + 20.0 * (0.1 + 0.15) / 0.12)
     course.hear("features", 1, 1, now=50.0)  # the end of a stage around this one
-    assert course.title == "3 of 4 directions"
+    assert course.title == "stage 3 of 4, directions"
     course.hear("compiling", 0, 1, now=50.0)
     assert course.title == "compiling"
     assert course.rest(50.0) is None
@@ -178,7 +178,8 @@ def test_a_terminal_has_one_line_of_progress_with_what_is_left_and_nothing_of_it
     assert all(len(one.strip()) <= int(environment.get("COLUMNS", 80)) for one in plain)
     if "COLUMNS" not in environment:
         assert any(
-            re.match(r"2 of 3 directions .* \d of 100, \d s, about \d+ (s|min) left", one) for one in plain
+            re.match(r"stage 2 of 3, directions .* \d of 100, \d s, about \d+ (s|min) left", one)
+            for one in plain
         )
     assert ("\x1b[9" in "".join(drawn)) == ("NO_COLOR" not in environment)
     assert drawn[-1].endswith("\x1b[2K")  # the line is erased
@@ -188,7 +189,7 @@ def test_a_terminal_has_one_line_of_progress_with_what_is_left_and_nothing_of_it
 def test_without_a_terminal_a_short_run_says_nothing_and_a_long_one_a_line_for_each_stage(how):
     assert run_python("-c", RUN.format(how="", pause=0.0)).stderr == ""
     told = run_python("-c", RUN.format(how=how, pause=0.0)).stderr.splitlines()
-    assert told == ["sfm-shapefit: 2 of 3 directions", "sfm-shapefit: 3 of 3 trust"]
+    assert told == ["sfm-shapefit: stage 2 of 3, directions", "sfm-shapefit: stage 3 of 3, trust"]
 
 
 @pytest.mark.parametrize("verbose", [False, True])
@@ -210,7 +211,7 @@ def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, capfd
         assert "bundle adjustment" not in done.stdout
         return
     assert "these images are of the past" in native
-    assert "sfm-shapefit: 2 of 10 directions\n" in done.stderr
+    assert "sfm-shapefit: stage 2 of 10, directions\n" in done.stderr
     assert re.search(r"seconds +│ read \d+\.\d\d, directions", done.stdout)
     assert "bundle adjustment" in done.stdout
 

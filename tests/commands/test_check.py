@@ -118,7 +118,7 @@ def test_what_map_doubts_check_does_not_call_good():
         assert found.verdict.cameras == doubted
         assert found.facts.evidence.second.ambiguous == doubted
         assert (
-            "evidence at least half as strong puts them elsewhere, or turns them"
+            "another place or rotation has at least half as much evidence"
             in found.facts.evidence.second.statement
         )
         assert " workspace " in found.facts.next_step.command  # it would be placed there again

@@ -73,7 +73,7 @@ def test_missing_and_broken_pictures_are_told_and_points_have_the_colors_of_the_
         seen = {element.image_id for element in point.track.elements}
         assert bool(point.color.any()) == bool(seen - ids)
     said = run("map", RING / "database.db", tmp_path / "bare", code=0).stdout
-    assert "colors: the points have none; --images FOLDER gives them those of the images\n" in said
+    assert "colors: the points have none; --images FOLDER takes them from the images\n" in said
 
 
 def test_colors_of_the_input_stay_and_a_model_that_the_user_changed_is_colored_as_it_is(pictures, tmp_path):

@@ -72,10 +72,14 @@ def test_pictures_without_exif_data_share_a_lens_unless_said(drawn, tmp_path):
         (nested / sub).mkdir(parents=True, exist_ok=True)
         shutil.copy(folder / "images" / name, nested / sub / name)
     counts = {}
+    for name in ("IMG_1.HEIC", ".IMG_2.HEIC", "IMG_1.MOV", "bad.jpg", "notes.txt"):
+        (nested / name).write_text("no picture")
+    unread = f"cannot read them: 1 .heic, 1 .mov, bad.jpg in {nested}"
     for mode in ("auto", "single", "per-folder", "per-image"):
-        made = sfm_shapefit.match_images(
-            nested, tmp_path / f"{mode}.d" / "database.db", camera_mode=mode, max_image_size=100
-        )
+        with pytest.warns(UserWarning, match=unread):
+            made = sfm_shapefit.match_images(
+                nested, tmp_path / f"{mode}.d" / "database.db", camera_mode=mode, max_image_size=100
+            )
         counts[mode] = survey(made)["num_cameras"]
     assert counts == {"auto": 2, "single": 1, "per-folder": 2, "per-image": 3}
 
@@ -204,7 +208,11 @@ def test_a_second_run_keeps_the_matches(drawn, told, mapped):
     out, _ = mapped
     before = (out / "database.db").stat().st_ino, survey(out / "database.db")
     assert "exists already" in run_refused("map", folder / "images", out, *told, code=3)
-    run("map", folder / "images", out, *told, "--overwrite", "--no-report", code=0)
+    unread = folder / "images" / "IMG_1.HEIC"
+    unread.write_text("no picture")
+    said = run("map", folder / "images", out, *told, "--overwrite", "--no-report", code=0).stdout
+    unread.unlink()
+    assert "cannot read them: 1 .heic in" in said
     assert ((out / "database.db").stat().st_ino, survey(out / "database.db")) == before
     assert not (out / "0" / "report.html").exists()
 
@@ -263,6 +271,10 @@ def test_images_become_sensors_of_the_rigs_of_a_file_also_those_that_are_added(d
         ("[{", "no file of rigs as COLMAP's rig_configurator takes"),
         ('[{"cameras": [{"image_prefix": "0"}]}]', "must have one reference sensor"),
         ('[{"cameras": [{"image_prefix": "b/", "ref_sensor": true}]}]', "no image begins with b/"),
+        (
+            '[{"cameras": [{"image_prefix": "", "ref_sensor": true}, {"image_prefix": "0"}]}]',
+            "rigs.json: 0 lacks cam_from_rig_rotation or cam_from_rig_translation",
+        ),
     ],
 )
 def test_rigs_that_the_images_cannot_be_are_refused(drawn, tmp_path, text, why):
@@ -308,7 +320,9 @@ def test_what_holds_no_images_is_refused_and_nothing_is_made(drawn, tmp_path):
     empty.mkdir()
     assert "holds no image" in run_refused("map", empty, out, code=3)
     (empty / "IMG_1.HEIC").write_bytes(b"")
-    assert "1 .heic; convert these to .jpg first" in run_refused("map", empty, out, code=3)
+    assert "but 1 .heic; convert these to .jpg first" in run_refused("map", empty, out, code=3)
+    (empty / "tour.mov").write_bytes(b"")
+    assert "take frames, as with `ffmpeg" in run_refused("map", empty, out, code=3)
     for name in ("a.jpg", "b.jpg"):
         (empty / name).write_bytes(b"no picture")
     assert "no two images that pycolmap can read" in run_refused("map", empty, out, code=3)

@@ -17,6 +17,8 @@ from sfm_shapefit.files.colmap.known import read_known
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.placement.control_points import control_gauge, fit_control_points
 from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.report.page import page_data
+from sfm_shapefit.report.results import draw_result
 from sfm_shapefit.scene.given import ControlPoints
 from tests.models import write_priors
 from tests.scenes import RING
@@ -80,8 +82,16 @@ def test_the_model_stands_where_the_points_are_and_check_points_say_so(ring, tmp
     assert rows["P6"]["error"] < 1e-4
     np.testing.assert_allclose(rows["P4"]["residual"], [0.0, 0.0, -1.0], atol=1e-3)
     assert rows["P0"]["num_agreeing_marks"] == rows["P0"]["num_marks"] - 1 == 7
+    columns = found.table("control_points")
+    assert list(columns["name"]) == [f"P{k}" for k in range(7)]
+    assert columns["residual_z"][4] == rows["P4"]["residual"][2]
+    assert (columns["num_marks"][0], columns["num_agreeing_marks"][0]) == (8, 7)
+    data = page_data(draw_result(found), found.facts)
+    assert data["control"][0][:3] == ["P4", "not used: contradicts the others", "1"]
+    assert data["notes"]["control"].startswith("5 control points off by ")
+    assert "; 1 check point off by " in data["notes"]["control"]
     said = " ".join(found.warnings)
-    assert "1 control point contradicts the others and sets nothing: P4, 1 off; check" in said
+    assert "1 control point contradicts the others and is not used: P4, off by 1; check" in said
     assert "1 mark of control points miss where the others put the point, that of P0 in" in said
 
 
@@ -160,11 +170,11 @@ def test_evaluate_maps_a_finished_model_onto_control_points_and_tells_both_error
     np.testing.assert_allclose(compared["points_from_model"]["rotation"], TURN, atol=1e-4)
     assert [row["use"] for row in compared["points"]] == ["control"] * 4 + ["unused", "check", "check"]
     assert told["warnings"][-1].startswith(
-        "1 control point contradicts the others and sets nothing: P4, 1 off"
+        "1 control point contradicts the others and is not used: P4, off by 1"
     )
     said = " ".join(CliRunner().invoke(app, command).stdout.replace("│", " ").split())
     assert "4 control points off by" in said
-    assert "2 check points off by 0.212 (root mean square), P6 most, by 0.3; 1 not used" in said
+    assert "2 check points off by 0.212 in space (root mean square), P6 most, by 0.3; 1 not used" in said
     assert "after a similarity onto 4 control points: scale 2.5, turned by 21.4 deg, moved by" in said
     with_reference = CliRunner().invoke(app, [*command[:2], *command[1:]])
     assert with_reference.exit_code == 2

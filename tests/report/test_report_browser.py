@@ -278,6 +278,8 @@ def test_it_fits_a_narrow_window_and_a_row_brings_the_scene_into_view(driver, re
     assert driver.execute_script(CUT_TEXTS) == []
     whole = "return [...document.querySelectorAll('#command, #lenses .scroll, #pieces .scroll')]"
     assert driver.execute_script(f"{whole}.filter((one) => one.scrollWidth > one.clientWidth).length") == 0
+    words = "return document.querySelector('#pairs td.verdict').innerText.trim()"
+    assert driver.execute_script(words) == "contradicts"
     driver.execute_script("document.querySelector('#pairs tbody tr').scrollIntoView()")
     click(driver, "#pairs tbody tr")
     wait_for(

@@ -483,7 +483,7 @@ LENGTHS = LengthFacts(
 
 def test_a_length_is_told_in_the_users_unit_or_relative_and_never_where_nothing_is_known():
     drawing, facts = make_drawing()
-    said = "length of 10 m here is known to ± 4 mm (95 %), worst direction up (± 6 mm)"
+    said = "length of 10 m is known to ± 4 mm (95 %), worst direction up (± 6 mm)"
 
     def told(lengths):
         known = replace(facts, lengths=lengths)
@@ -521,6 +521,17 @@ def test_scale_bars_have_a_table_the_worst_first():
     bars = page_data(drawing, replace(facts, scale_bars=(bar, worse)))["bars"]
     assert [cells[0] for cells in bars] == ["short", "long"]
     assert bars[1] == bar.cells
+    assert replace(bar, use="unused").cells[1] == "not used: contradicts the others"
+
+
+def test_of_cameras_of_equal_trust_those_whose_pairs_are_off_most_come_first():
+    drawing, facts = make_drawing()
+    trusted = replace(drawing.cameras, trust=np.ones_like(drawing.cameras.trust), reasons=[""] * 25)
+    facts = replace(facts, verdict=replace(facts.verdict, cameras=()))
+    errors_deg = unpacked(page_data(replace(drawing, cameras=trusted), facts)["cameras"]["error"])
+    known = errors_deg[np.isfinite(errors_deg)]
+    assert len(known) > 20
+    assert (np.diff(known) <= 0.0).all()
 
 
 def test_nothing_known_nothing_claimed():

@@ -19,7 +19,7 @@ import pycolmap
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.executors import Advance
-from sfm_shapefit.base.paths import refuse_no_folder
+from sfm_shapefit.base.paths import PICTURES, TAKE_FRAMES, VIDEOS, refuse_no_folder
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.files.colmap.bitmaps import earth_position, read_bitmap
 from sfm_shapefit.files.colmap.intrinsics import fisheye_guess
@@ -28,8 +28,7 @@ from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, name_of
 from sfm_shapefit.files.matching_options import MatchingOptions
 from sfm_shapefit.files.model_folder import model_folders
 
-_READABLE = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
-_OTHERS = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".mp4", ".mov", ".insv"})
+_UNREADABLE = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", *VIDEOS})
 """Suffixes of photographs and videos that pycolmap does not read."""
 _DEFAULT_FOCAL = 1.2  # picture widths; COLMAP's guess where the EXIF data have no focal length
 _BLOCK = 10  # images of a block; the pairs of two blocks are written together, a few seconds' work
@@ -37,8 +36,17 @@ _POLL_S = 0.5  # seconds between two looks at how far the database is; each asks
 _SEED = 0  # seed of the samples that verify a pair; any will do, if it is always the same
 
 
-def find_photographs(folder: Path) -> list[str]:
-    """Return the names of the images in a folder and those below it, as COLMAP has them, in their order.
+class Photographs(NamedTuple):
+    """What a folder and those below it hold."""
+
+    names: list[str]
+    """Names of the images, as COLMAP has them, in their order."""
+    unread: list[str]
+    """How many photographs and videos pycolmap does not read, by suffix."""
+
+
+def find_photographs(folder: Path) -> Photographs:
+    """Return what a folder and those below it hold.
 
     Raises:
         InputError: if it is no folder, or holds fewer than two images.
@@ -49,21 +57,24 @@ def find_photographs(folder: Path) -> list[str]:
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for file in files:
             suffix = Path(file).suffix.lower()
-            if suffix in _READABLE and not file.startswith("."):
+            if suffix in PICTURES and not file.startswith("."):
                 names.append(Path(place, file).relative_to(folder).as_posix())
-            elif suffix in _OTHERS:
+            elif suffix in _UNREADABLE and not file.startswith("."):
                 others[suffix] += 1
+    unread = [f"{number} {suffix}" for suffix, number in sorted(others.items())]
     if len(names) < 2:
         for model in (folder, *model_folders(folder)):
             if any((model / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
                 anew = f"sfm-shapefit locate {model} OUT places its images anew"
                 raise InputError(f"{model} is a COLMAP model without a database.db; {anew}")
-        found = f"only {names[0]}" if names else "no image that can be read"
-        more = first_of([f"{n} {suffix}" for suffix, n in others.items()])
-        unread = f"{' and' if names else ', only'} {more}" if more else ""
-        advice = "; convert these to .jpg first" if others else "; give a folder of two images or more"
-        raise InputError(f"{folder} has no database.db and holds {found}{unread}{advice}")
-    return sorted(names)
+        found = "no image" if not names else f"only {names[0]}"
+        advice = ["give a folder of two images or more"]
+        if others:
+            found += f" and {first_of(unread)}" if names else f", but {first_of(unread)}"
+            advice = ["convert these to .jpg first"] if others.keys() - VIDEOS else []
+            advice += [TAKE_FRAMES] if others.keys() & VIDEOS else []
+        raise InputError(f"{folder} has no database.db and holds {found}; {'; '.join(advice)}")
+    return Photographs(sorted(names), unread)
 
 
 class _Picture(NamedTuple):
@@ -308,12 +319,17 @@ def refuse_rigs(options: MatchingOptions, names: Sequence[str]) -> None:
     """Refuse rigs that these images cannot be.
 
     Raises:
-        InputError: if no image begins with a sensor's prefix.
+        InputError: if no image begins with a sensor's prefix, or a sensor has no pose.
     """
-    for prefix in _prefixes_of(_read_rigs(options)):
+    path, rigs = options.rig_config_path, _read_rigs(options)
+    for prefix in _prefixes_of(rigs):
         if not any(name.startswith(prefix) for name in names):
+            raise InputError(f"{path}: no image begins with {prefix}; the first is {names[0]}")
+    for sensor in (sensor for rig in rigs for sensor in rig.cameras):
+        if not sensor.ref_sensor and sensor.cam_from_rig is None:
             raise InputError(
-                f"{options.rig_config_path}: no image begins with {prefix}; the first is {names[0]}"
+                f"{path}: {sensor.image_prefix} lacks cam_from_rig_rotation or cam_from_rig_translation; "
+                "give both, or map the images without a file of rigs"
             )
 
 

@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 from sfm_shapefit.base.atomic_folder import private_folder
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.paths import refuse_irregular_file
+from sfm_shapefit.base.paths import PICTURES, TAKE_FRAMES, VIDEOS, refuse_irregular_file
 
 DATABASE_NAMES = ("database.db", "colmap.db")
 """What COLMAP's own tools, and instant-ngp's, call their databases."""
@@ -227,6 +227,10 @@ def _read_header(path: Path) -> bytes:
         raise InputError(f"the database {path} does not exist") from None
     except OSError as error:
         raise InputError(f"the database {path} cannot be read: {error.strerror}") from None
+    if path.suffix.lower() in VIDEOS:
+        raise InputError(f"{path} is a video; {TAKE_FRAMES}")
+    if path.suffix.lower() in PICTURES:
+        raise InputError(f"{path} is an image; give the folder of all images")
     if not header:
         raise InputError(f"the database {path} is empty; run COLMAP's feature extraction and matching first")
     if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):

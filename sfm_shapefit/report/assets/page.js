@@ -53,7 +53,7 @@ const drawFacts = () => {
   fill("expert-facts", ...data.expertFacts.map((text) => element("li", text)));
   if (isGood) $("looks-title").textContent = "Of note";
   const looks = data.looks.map(({ text, camera, pair }) => {
-    const item = element("li", "", isGood ? "fine" : "");
+    const item = element("li");
     const target = camera ?? pair;
     if (target === null) item.append(element("span", text));
     else item.append(button(text, "link", () => select(camera === null ? "pair" : "camera", target)));
@@ -67,14 +67,16 @@ const drawFacts = () => {
   const rest = folded(`${counted(unchanged.length, "option")} as by default`, factTable(unchanged));
   fill("options", changed.length ? factTable(changed) : element("p", "None.", "muted"), rest);
 };
-const plainTable = (names, rows) => {
-  const table = element("table", "", "plain");
+// In narrow windows a row becomes a list of its cells; or, if `minor` ones are named, only these are hidden.
+const plainTable = (names, rows, minor) => {
+  const table = element("table", "", minor ? "" : "plain");
+  const look = (name) => (minor?.includes(name) ? "minor" : "");
   const head = table.createTHead().insertRow();
-  for (const name of names) head.append(element("th", name));
+  for (const name of names) head.append(element("th", name, look(name)));
   const body = table.createTBody();
   for (const texts of rows) {
     const row = body.insertRow();
-    row.append(...texts.map((text) => element("td", text)));
+    row.append(...texts.map((text, k) => element("td", text, look(names[k]))));
     names.forEach((name, k) => { row.cells[k].dataset.label = name; }); // narrow windows show it beside the text
   }
   const scroll = element("div", "", "scroll");
@@ -96,10 +98,10 @@ const drawControl = () => {
   $("intrinsics-card").hidden = !data.intrinsics.length;
   fill("intrinsics", plainTable(["Camera", "Model", "Images", "Focal length given (px)", "Found (px)", "Change", "Distortion"], data.intrinsics));
   $("control-card").hidden = !data.control.length;
-  fill("control", plainTable(["Name", "Use", "Off by (units)", "Along the axes (units)", "Off by (px)", "Marks"], data.control));
+  fill("control", plainTable(["Name", "Use", "Off by (units)", "Along the axes (units)", "Off by (px)", "Marks"], data.control, ["Along the axes (units)", "Off by (px)"]));
   $("control-note").textContent = data.notes.control;
   $("bars-card").hidden = !data.bars.length;
-  fill("bars", plainTable(["Name", "Use", "Known (units)", "In the model (units)", "Off by (units)", "(σ)", "Off by (px)", "Marks"], data.bars));
+  fill("bars", plainTable(["Name", "Use", "Known (units)", "In the model (units)", "Off by (units)", "(σ)", "Off by (px)", "Marks"], data.bars, ["(σ)", "Off by (px)", "Marks"]));
 };
 const drawLoops = () => {
   $("loops-card").hidden = !data.loops.length;

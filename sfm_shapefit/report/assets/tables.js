@@ -131,7 +131,7 @@ const verdictCell = (p) => {
   return cell;
 };
 const drawTables = (onChoice) => {
-  // Rows arrive worst first: the cameras by trust, the pairs by verdict and residual.
+  // Rows arrive worst first: the cameras by trust and pair error, the pairs by verdict and residual.
   const isSaid = new Set(data.looks.map(({ camera }) => camera));
   const why = (k) => (isSaid.has(k) ? "" : reason(cameras.reason[k]) || (isPlaced(k) ? "" : "left out"));
   const shift = cameras.shift ? [aligned("Shift", cameras.shift, 2, "How far it is from where the input has it, in units")] : [];
