@@ -45,7 +45,9 @@ def refuse_absent(*paths: Path | None) -> None:
             raise InputError(f"{path} does not exist")
 
 
-def refuse_no_folder(folder: Path, wanted: str = "the one that the names of the images start from") -> None:
+def refuse_no_folder(
+    folder: Path, wanted: str = "the one to which the names of the images are relative"
+) -> None:
     """Refuse what is no folder, of images unless something else is wanted.
 
     Raises:

@@ -107,9 +107,9 @@ def check_command(
         from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.files.output_paths import refuse_file
-        from sfm_shapefit.pipeline.inputs import choose_inputs
+        from sfm_shapefit.pipeline.inputs import inputs_to_check
 
-        known = choose_inputs(source, database).database
+        known = inputs_to_check(source, database).database
         if second_opinion is not None and no_second_opinion:
             raise InputError("--second-opinion and --no-second-opinion contradict each other; give one")
         _refuse_without_use(known, images, report, second_opinion, max_minutes)

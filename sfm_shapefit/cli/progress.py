@@ -39,7 +39,7 @@ def _left(course: Course, now: float) -> str:
     if rest is not None and rest >= 1.0:
         return f"about {_roughly(rest)} left"
     is_long = rest is None and rest_of_stage is not None and rest_of_stage >= 1.0
-    return f"this stage about {_roughly(rest_of_stage or 0.0)} more" if is_long else ""
+    return f"about {_roughly(rest_of_stage or 0.0)} left in this stage" if is_long else ""
 
 
 @contextmanager

@@ -14,14 +14,14 @@ from sfm_shapefit.facts.check_result import CheckResult, OtherModel
 from sfm_shapefit.facts.checked_pieces import CheckedPiece, CheckedPieces
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import MapResult
-from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database
+from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself, read_source
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.model_folder import model_folders
 from sfm_shapefit.judgement.pair_fits import fit_pairs
 from sfm_shapefit.pairs.direction_options import DirectionOptions
-from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
+from sfm_shapefit.pipeline.inputs import inputs_to_check, open_source
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
@@ -40,8 +40,8 @@ def check(
 
     Args:
         model: a reconstruction, a result, a model folder or a list of poses, as for `locate`.
-        database: as for `locate`; without one, the pairs are those that share points of the model, which
-            agree with it more easily.
+        database: as for `locate`, else the one that an output was made of; without one, the pairs are those
+            that share points of the model, which agree with it more easily.
         images: folder of the model's pictures, from which features and matches of chosen pairs are made if
             there is no database.
         max_minutes: minutes after which no more of these are matched, so that the answer depends on the
@@ -58,7 +58,7 @@ def check(
         raise InputError(f"max_minutes must be >= 0, got {max_minutes}")
     clock = Clock.of(progress)
     with clock("read"):
-        inputs = choose_inputs(model, database)
+        inputs = inputs_to_check(model, database)
         has_pictures = images is not None and inputs.database is None and max_minutes != 0.0
         posed = read_by_itself(model, with_lenses=True) if has_pictures else read_source(model, database)[0]
     other = None
@@ -124,7 +124,7 @@ def check_pieces(
     models = model_folders(Path(folder))
     if len(models) < 2:
         raise InputError(f"{folder} has no models 0, 1, ...; give a folder of several, or `check` one")
-    source = database if database is not None else find_database(models[0])
+    source = inputs_to_check(models[0], database).database
     if second_opinion is True and source is not None:
         try:
             second_opinion = map_database(source, progress=progress)

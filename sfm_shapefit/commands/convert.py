@@ -41,7 +41,7 @@ FORMATS = {
     "colmap-txt": ExportFormat("a folder of text files", "sfm-shapefit check {out}"),
     "nerf": ExportFormat(
         "transforms.json of nerfstudio and instant-ngp",
-        "train on {out} with nerfstudio or instant-ngp, from the folder of the images",
+        "put the images into images/ beside {out}, and train on it with nerfstudio or instant-ngp",
         (".json",),
         "nerf:nerf_text",
     ),
@@ -96,7 +96,8 @@ def convert(
         source: a COLMAP folder, which may be an output, a reconstruction, a result, OpenSfM's
             reconstruction.json, or a list of poses: transforms.json, a trajectory.
         target: the file, or for COLMAP's formats the folder, to be made. Beside a .ply with the points stands
-            one with the cameras, *_cameras.ply; beside a transforms.json one with the points, *_points.ply.
+            one with the cameras, *_cameras.ply; beside a transforms.json one with the points, *_points.ply,
+            and it looks for the images in images/ there.
         target_format: one of `FORMATS`; by the suffix of `target` if None.
         overwrite: replace an existing file; folders are never replaced.
         crs: system of coordinates on Earth, "utm" or a code of `files.colmap.earth`; empty: the model's own.

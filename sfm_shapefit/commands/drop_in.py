@@ -121,7 +121,7 @@ def _options_of(theirs: "_PycolmapOptions", database: Path) -> tuple[MapOptions,
     lost = [f"{name}={changed[name]}" for name, end in ends.items() if end not in _WITHOUT_EFFECT | kept]
     if lost:
         said = f"these options of pycolmap have no effect: {', '.join(lost)}"
-        warnings.warn(f"{said}; docs/coming_from.md says what there is instead", stacklevel=3)
+        warnings.warn(f"{said}; help(sfm_shapefit.MapOptions) says what there is instead", stacklevel=3)
     return MapOptions(**values), priors
 
 

@@ -1,6 +1,6 @@
 """`workspace`: pictures and model without distortion, in the folders that splatting and dense programs read.
 
-OUT/images/              pictures, all in one folder
+OUT/images/              pictures, all in one folder: that of a/b.jpg is a_b.jpg
 OUT/masks/               their masks, NAME.png for NAME, if there are any: brush, LichtFeld, COLMAP's fusion
 OUT/sparse/0/            the model, and its points as points3D.ply: 3DGS, gsplat, brush, LichtFeld
 OUT/sparse/, OUT/stereo/ the model again and the plan of the stereo: COLMAP's dense commands, OpenMVS
@@ -25,7 +25,7 @@ from sfm_shapefit.base.geometry import Similarity, angle_between_deg
 from sfm_shapefit.base.paths import MASKS, refuse_no_folder
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.base.wording import counted, counted_are, first_of
-from sfm_shapefit.facts.tables import model_datum
+from sfm_shapefit.facts.tables import model_datum, model_doubt
 from sfm_shapefit.files.colmap.listed_poses import read_by_itself
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, model_of, read_model
 from sfm_shapefit.files.colmap.picture_colors import PictureFolder, color_model
@@ -61,7 +61,9 @@ class Workspace:
     offset: tuple[float, float, float]
     """What was subtracted from all coordinates, after leveling."""
     warnings: tuple[str, ...]
-    """Images that are left out, and why."""
+    """The verdict on the model where it is not good, and images that are left out, and why."""
+    renamed: Mapping[str, str]
+    """By the names of images in folders: those of their pictures, which are in one folder."""
 
     @property
     def told(self) -> list[str]:
@@ -69,9 +71,12 @@ class Workspace:
         model = self.reconstruction
         counts = f"{counted(model.num_reg_images(), 'picture')}, {counted(model.num_points3D(), 'point')}"
         warnings = [f"warning: {one}" for one in self.warnings]
+        renamed = [f"{old} becomes images/{new}" for old, new in self.renamed.items()]
+        names = [f"pictures: {first_of(renamed)}"] if renamed else []
         offset = "offset: {!r} {!r} {!r}, subtracted from all coordinates".format(*self.offset)
         shifted = [f"{offset}, see offset.xyz"] if any(self.offset) else []
-        return [counts, f"level: {self.level}", *shifted, *warnings, f"written to {self.folder}/"]
+        level = f"level: {self.level}"
+        return [counts, *names, level, *shifted, *warnings, f"written to {self.folder}/"]
 
 
 def workspace(
@@ -138,12 +143,15 @@ def workspace(
             _write_models(read_model(made), folder, "masks" if masks else "")
             if world.offset_line:
                 (folder / "offset.xyz").write_bytes(world.offset_line)
+    doubt = model_doubt(model)
+    warnings = [f"the verdict on the model is: {doubt}"] if doubt else []
     return Workspace(
         folder=Path(out),
         reconstruction=made,
         level=statement,
         offset=world.offset,
-        warnings=(*read.notes, *_warn(made, reasons)),
+        warnings=(*warnings, *read.notes, *_warn(made, reasons)),
+        renamed={flat.name: flat.names[0] for flat in flats if Path(flat.name).name != flat.name},
     )
 
 

@@ -159,11 +159,11 @@ def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
     changes = [row.change for row in found]
     unknown = sum(row.decided_by == "undetermined" for row in rows)
     held = len(rows) - len(changes) - unknown
-    parts = [f"{len(changes)} of {len(rows)} cameras in doubt have another focal length now"]
+    parts = [f"the focal lengths of {len(changes)} of {len(rows)} cameras in doubt changed"]
     if changes:
         low, middle, high = (quantile(np.array(changes), share) for share in (0.0, 0.5, 1.0))
         parts = [
-            f"{parts[0]}, by {low:+.1%} to {high:+.1%} (median {middle:+.1%}), "
+            f"{parts[0]} by {low:+.1%} to {high:+.1%} (median {middle:+.1%}), "
             f"most that of {max(found, key=lambda row: abs(row.change)).label}"
         ]
     parts += [f"{unknown} kept the given one, as the matches do not determine it"] if unknown else []

@@ -185,7 +185,8 @@ class MapResult(Written, Tabled):
 
     def _headline(self) -> str:
         models = counted(len(self.models), "model")
-        return f"{self.num_placed} of {self.num_images} images placed in {models}"
+        images = f"{self.num_placed} of {self.num_images} images placed in {models}"
+        return f"{self.verdict.grade.value}: {images}"
 
 
 def _averaging_of(model: LocateResult) -> AveragedRotations:

@@ -29,7 +29,8 @@ class RefinedSensor(Record):
         """How far it turned and moved, and how sure that is."""
         return (
             f"camera {self.camera} turned by {self.turned_deg:.3g} deg (± {self.turn_sigma_deg:.2g}) and "
-            f"moved by {self.moved:.3g} (± {self.place_sigma:.2g}), {self.distance:.4g} from the reference"
+            f"moved by {self.moved:.3g} (± {self.place_sigma:.2g}), at {self.distance:.4g} from the "
+            "reference sensor"
         )
 
 

@@ -46,9 +46,9 @@ def describe_loops(loops: Sequence[Loop]) -> str:
         return ""
     pairs = sum(loop.num_pairs for loop in loops)
     lost = sum(loop.num_refused for loop in loops)
-    said = f"{counted(pairs, 'pair')} far apart in their order"
+    said = f"{counted(pairs, 'pair')} of images far apart in their order"
     if not lost:
-        return f"{said}, used, as the images between agree"
+        return f"{said}, all used: the images between agree with them"
     worst = max(loops, key=lambda loop: (loop.num_refused, loop.num_matches))
     are, them = ("is", "it") if lost == 1 else ("are", "them")
     return (

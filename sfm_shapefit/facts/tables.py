@@ -237,6 +237,15 @@ def model_scale_sigma(model: Any) -> float | None:
     return sigma
 
 
+def model_doubt(model: Any) -> str:
+    """Return the verdict on a result or model, likewise, where it is not good; else an empty text."""
+    if isinstance(model, Path | str):
+        statement = told_of(model, "verdict", lambda found: found.get("statement"))
+    else:
+        statement = getattr(getattr(model, "verdict", None), "statement", None)
+    return "" if statement in (None, "good") else str(statement)
+
+
 def model_options(model: Any) -> dict[str, Any]:
     """Return the options with which a result or model was made, likewise; none of another program's."""
     with suppress(InputError):  # which may have a locate.json of its own

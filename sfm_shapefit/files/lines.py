@@ -46,8 +46,8 @@ def refuse_database(path: Path) -> None:
     """
     if is_database(path):
         raise InputError(
-            f"{path} is a database: `sfm-shapefit map`, in Python `map_database`, makes a model from it "
-            "alone; elsewhere give the model's folder, and the database after it (--database, database=)"
+            f"{path} is a database: `sfm-shapefit map`, in Python `map_database`, makes a model of its "
+            "matches; give a model's folder here (the database goes by --database, database=, if at all)"
         )
 
 

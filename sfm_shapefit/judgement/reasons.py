@@ -61,7 +61,10 @@ class ModelVerdict(Record):
     grade: Annotated[Grade, "What to do with it."]
     statement: Annotated[str, "The same in a sentence."] = ""
     cameras: Annotated[tuple[str, ...], "To be looked at, the least trusted first."]
-    reasons: Annotated[tuple[str, ...], "Why the grade is not better; none if it is good."]
+    reasons: Annotated[
+        tuple[str, ...],
+        "Why the model as a whole has no better grade; findings have the reasons of single images too.",
+    ]
     findings: Annotated[tuple[Reason, ...], "All that speaks against it; each of the cameras is in one."] = ()
 
     @classmethod

@@ -105,9 +105,9 @@ class SecondOpinion(Record):
             where = f"{are(self.ambiguous)} in the same place {by}"
             parts.append(f"{where}, but another place or rotation has at least half as much evidence")
         percent = rounded(100.0 * self.usual, digits=2) if self.usual > _LEAST_TOLD else "less than 0.001"
-        usual = f"positions differ by {percent} % of their spread, median"
+        usual = f"the median difference of positions is {percent} % of their spread"
         if self.wrong or self.undecided:
-            usual += f", and at most by {rounded(100.0 * self.farthest, digits=2)} %"
+            usual += f", and the largest {rounded(100.0 * self.farthest, digits=2)} %"
         if self.has_nothing_in_common:
             return f"{self.num_common} cameras have nothing in common with their places {by} ({usual})"
         told = "; ".join(parts) or f"{self.num_common} cameras are in the same place {by}"

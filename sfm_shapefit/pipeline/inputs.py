@@ -5,7 +5,7 @@ The view graph tells focal lengths that were only guessed before anything is pla
 
 import os
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,10 +16,12 @@ from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
 from sfm_shapefit.facts.command_options import PlacingOptions, Source
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.result import Inputs
+from sfm_shapefit.facts.tables import read_trust, told_of
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, open_database
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
-from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs, refuse_no_features
+from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs, match_names, refuse_no_features
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.files.pair_list import read_pair_list
@@ -135,7 +137,7 @@ def open_matches(model: ColmapModel, inputs: Inputs) -> tuple[DatabaseMatches | 
     except ShapeFitError as error:
         if not inputs.is_found or inputs.left_out:
             raise
-        statement = f"the model's own tracks; the database beside the model cannot be used: {error}"
+        statement = f"the model's own tracks; the database that was found cannot be used: {error}"
         return TrackMatches(model), replace(inputs, database=None, statement=statement)
 
 
@@ -209,6 +211,27 @@ def choose_inputs(
     statement = f"inlier matches of {path}{beside}"
     is_found = database is None and source == "auto"
     return Inputs(folder=folder, database=path, statement=statement, is_found=is_found)
+
+
+def inputs_to_check(model: ModelSource, database: Path | str | None) -> Inputs:
+    """Return the same for `check`: without a database, an output is judged by the one that it was made of."""
+    inputs = choose_inputs(model, database)
+    own = _database_of_output(inputs.folder) if inputs.folder and inputs.database is None else None
+    if own is None:
+        return inputs
+    statement = f"inlier matches of {own} (which the model's locate.json names)"
+    return replace(inputs, database=own, statement=statement, is_found=True)
+
+
+def _database_of_output(folder: Path) -> Path | None:
+    """Return the database that an output names, if it is there and has all images of it; else None."""
+    with suppress(InputError):
+        path = told_of(folder, "inputs", lambda found: Path(found.get("database")))
+        if path is not None and path.is_file():
+            names = sorted(read_trust(folder / "cameras.csv"))
+            with closing(DatabaseFile(path)) as file:
+                return path if {*range(len(names))} <= {*match_names(file, names).values()} else None
+    return None
 
 
 def inputs_from(database: Path) -> Inputs:

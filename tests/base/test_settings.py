@@ -108,6 +108,8 @@ def test_groups_and_single_options_go_together_however_deep_they_are():
     )
     with pytest.raises(TypeError, match=r"'placement' is no option of MapOptions; give PlacementOptions"):
         MapOptions(placement=3)
+    with pytest.raises(TypeError, match="'rotations' is no option of MapOptions; it is one of LocateOptions"):
+        MapOptions(rotations="held")
     with pytest.raises(TypeError, match="'min_inlier' is no option of DirectionOptions; did you mean"):
         MapOptions(directions={"min_inlier": 3})
 

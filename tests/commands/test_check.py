@@ -23,7 +23,7 @@ from sfm_shapefit.report.results import draw_checked
 from tests.facts.test_schema import problems
 from tests.judgement.made import opinion_with, place_of
 from tests.program import run, run_refused
-from tests.scenes import COURTYARD, PHOTOGRAPHED, RING, fingerprint
+from tests.scenes import COURTYARD, PHOTOGRAPHED, RING, edit_database, fingerprint
 from tests.structures import pictures_of
 
 
@@ -200,6 +200,21 @@ def test_a_model_that_nothing_speaks_for_does_not_pass_strict(tmp_path):
     strangers = spoiled(tmp_path / "strangers", names="other-{}".format)
     database = ("--database", RING / "database.db")
     assert "has 0 of the model's 8 images" in run_refused("check", strangers, *database)
+
+
+def test_an_output_is_judged_by_the_database_that_it_names_while_that_has_its_images(tmp_path, ring_mapped):
+    database = shutil.copy(RING / "database.db", tmp_path / "ring.db")
+    found = replace(ring_mapped.models[0], inputs=replace(ring_mapped.models[0].inputs, database=database))
+    found.write(tmp_path / "far/below/0")
+    assert repr(ring_mapped) == "<MapResult: good: 8 of 8 images placed in 1 model>"
+    judged = check(tmp_path / "far/below/0", second_opinion=ring_mapped).facts
+    assert judged.has_matches
+    assert judged.inputs.directions == f"inlier matches of {database} (which the model's locate.json names)"
+    run("check", tmp_path / "far/below/0", "--strict", "--no-second-opinion", "-q", code=0)
+    edit_database(database, "UPDATE images SET name = 'other_' || name WHERE image_id = 1")
+    assert not check(tmp_path / "far/below/0").facts.has_matches
+    Path(database).unlink()
+    assert not check(tmp_path / "far/below/0").facts.has_matches
 
 
 def test_a_model_beside_another_scenes_database_is_doubted():

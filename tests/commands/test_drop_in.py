@@ -48,7 +48,7 @@ def test_lenses_that_pycolmap_is_to_keep_are_kept_and_options_without_counterpar
     grown.ba_refine_focal_length = grown.ba_refine_extra_params = grown.multiple_models = False
     models = [sfm_shapefit.global_mapping(guessed, "", tmp_path / "free")]
     models.append(sfm_shapefit.global_mapping(guessed, "", tmp_path / "global", globally))
-    with pytest.warns(UserWarning, match=r"have no effect: multiple_models=False; docs/coming_from"):
+    with pytest.warns(UserWarning, match=r"have no effect: multiple_models=False; help"):
         models.append(sfm_shapefit.global_mapping(guessed, "", tmp_path / "grown", grown, input_path=""))
     fixed = pycolmap.IncrementalPipelineOptions(constant_cameras={camera.camera_id}, constant_rigs={1})
     models.append(sfm_shapefit.global_mapping(guessed, "", tmp_path / "fixed", fixed))

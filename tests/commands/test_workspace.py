@@ -341,10 +341,21 @@ def test_pictures_of_several_folders_are_one_folder_of_pictures_that_can_be_writ
     for image_id, name in enumerate(("a/b.png", "a_b.png", "c.webp"), start=1):
         (sky.images / sky.model.image(image_id).name).rename(sky.images / name)
         sky.model.images[image_id].name = name
-    sfm_shapefit.workspace(sky.model, sky.images, tmp_path / "out", level="never")
+    made = sfm_shapefit.workspace(sky.model, sky.images, tmp_path / "out", level="never")
+    assert made.told[1] == "pictures: a/b.png becomes images/a_b.png"
     written = {path.name for path in (tmp_path / "out/images").iterdir()}
     assert written == {"a_b.png", "a_b_.png", "c.png"}
     assert len(list(read_as_3dgs(tmp_path / "out"))) == 3
+
+
+def test_the_verdict_of_a_model_that_is_not_good_is_said_again(tmp_path):
+    sky = draw_sky(tmp_path, ["pinhole"])
+    sky.model.write(tmp_path / "images")  # any folder that exists
+    for name, statement in {"bad": "do not use: 5 of 16 cameras stand apart", "good": "good"}.items():
+        (tmp_path / "images/locate.json").write_text(json.dumps({"verdict": {"statement": statement}}))
+        made = sfm_shapefit.workspace(tmp_path / "images", sky.images, tmp_path / name)
+        said = [one for one in made.warnings if "verdict" in one]
+        assert said == ([f"the verdict on the model is: {statement}"] if name == "bad" else [])
 
 
 def test_pictures_that_are_missing_or_broken_are_named_and_left_out(tmp_path):

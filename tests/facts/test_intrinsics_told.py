@@ -74,7 +74,7 @@ def test_many_cameras_are_told_in_one_sentence():
     rows += [row(9, "undetermined", found=1000.0), row(10, "held", found=1000.0)]
     (line,) = describe_intrinsics(rows)
     assert line == (
-        "3 of 5 cameras in doubt have another focal length now, by +10.0% to +30.0% (median +20.0%), most "
+        "the focal lengths of 3 of 5 cameras in doubt changed by +10.0% to +30.0% (median +20.0%), most "
         "that of camera 3 (3.jpg and 3 more); 1 kept the given one, as the matches do not determine it; 1 "
         "were not to be changed; locate.json has each"
     )

@@ -67,7 +67,7 @@ def test_a_database_that_cannot_be_used_stops_no_command_that_found_it(scene, tm
     assert found.inputs.database is None
     assert [row.center for row in found.cameras] == [row.center for row in alone.cameras]
     said = run("check", scene / "sparse/0", code=0).stdout
-    assert f"the model's own tracks; the database beside the model cannot be used: {path}" in said
+    assert f"the model's own tracks; the database that was found cannot be used: {path}" in said
     assert "verdict: good" in said
     assert told[:20] in " ".join(run("inspect", scene / "sparse/0", code=0).stdout.replace("│", "").split())
 
