@@ -168,7 +168,12 @@ def explained(settings: type[S]) -> type[S]:
 
 def hint(name: str, known: Iterable[str]) -> str:
     """Say what a name that is not known may stand for, or which other settings have it."""
-    if owners := [one.__name__ for one in Composed.__subclasses__() if name in homes_of(one)]:
+    owners = {
+        one.__name__: None
+        for one in Composed.__subclasses__()
+        if any(name == item.name for inside in setting_groups(one) for item in inside.options)
+    }
+    if owners:
         return f"it is one of {', '.join(owners)}"
     near = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
