@@ -75,11 +75,7 @@ def map_database(
 
 
 def refuse_useless_files(database: Path, options: MapOptions, priors: Path | str | None) -> None:
-    """Refuse files that `map_database` could not use; the database needs no features for that.
-
-    Raises:
-        InputError: if there is one; the message says what to do.
-    """
+    """Raise InputError if `map_database` could not use the files; the database needs no features yet."""
     with closing(DatabaseFile(database)) as file:
         read_beside(file, read_images(file).images, options, priors)
 

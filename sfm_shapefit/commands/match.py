@@ -75,10 +75,9 @@ def match_images(
 def begin_database(
     folder: Path, path: Path, options: MatchingOptions, clock: Clock
 ) -> tuple[PhotographDatabase, list[str]]:
-    """Make a database of photographs with images and lenses; errors as `match_images`.
+    """Make a database of photographs with images and lenses, and say what the user should know, in sentences.
 
-    Returns:
-        the database, and what the user should know, a sentence each.
+    Errors are those of `match_images`.
     """
     refuse_lens(options)
     if options.mask_path:
@@ -111,16 +110,11 @@ def match_begun(made: PhotographDatabase, clock: Clock) -> None:
 
 
 def _record_of(database: Path) -> Path:
-    """Return the file that says how a database was made."""
     return database.with_name(MATCHING_FILE)
 
 
 def _remember(database: Path, options: MatchingOptions) -> None:
-    """Write with which options a database is made, or see that it was begun with the same.
-
-    Raises:
-        InputError: if it was not, or by another program.
-    """
+    """Write with which options a database is made; InputError if it was begun with others or elsewhere."""
     record, told = _record_of(database), flat_values(options)
     if not database.exists():
         return write_json(told, record)

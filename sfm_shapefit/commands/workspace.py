@@ -10,7 +10,7 @@ OUT/offset.xyz           what was subtracted from the coordinates in all of thes
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,7 +62,7 @@ class Workspace:
     """What was subtracted from all coordinates, after leveling."""
     warnings: tuple[str, ...]
     """The verdict on the model where it is not good, and images that are left out, and why."""
-    renamed: Mapping[str, str]
+    renamed: dict[str, str]
     """By the names of images in folders: those of their pictures, which are in one folder."""
 
     @property
@@ -164,7 +164,7 @@ def _refuse_no_masks(flats: Sequence[Flat], masks: Path | None) -> None:
         )
 
 
-def _warn(made: "pycolmap.Reconstruction", reasons: Mapping[str, str]) -> Iterator[str]:
+def _warn(made: "pycolmap.Reconstruction", reasons: dict[str, str]) -> Iterator[str]:
     for why in dict.fromkeys(reasons.values()):
         names = [name for name, reason in reasons.items() if reason == why]
         yield f"{counted_are(len(names), 'image')} left out ({why}): {first_of(names)}"

@@ -431,7 +431,9 @@ def test_residuals_of_a_lens_are_arrows_with_their_scale_and_what_they_say(drive
     drawing, facts = make_drawing()
     places = np.stack(np.meshgrid([0.25, 0.75], [0.25, 0.75]), axis=-1).reshape(-1, 2)
     means = np.array([[0.3, 0.0], [0.0, 0.3], [-0.3, 0.0], [0.0, -0.3]])
-    field = LensField("Camera 1, <b>OPENCV</b>", 1.5, places, means, "They point outward.")
+    field = LensField(
+        "Camera 1, <b>OPENCV</b>", 1.5, places, means, "They point outward.", np.empty(0, dtype=np.int64)
+    )
     write_report(replace(drawing, fields=(field,)), facts, tmp_path / "report.html")
     opened(driver, tmp_path / "report.html")
     card = driver.find_element("id", "fields-card")
