@@ -94,6 +94,10 @@ class Similarity:
         return Alignment(scale=self.scale, rotation=rotation, translation=translation)
 
 
+UNMOVED = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
+"""The map in space that leaves all where it is."""
+
+
 class Alignment(Record):
     """A similarity of the world: scale * rotation @ center + translation."""
 

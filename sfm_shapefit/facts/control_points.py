@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import Alignment, Similarity, rotation_angles_deg
+from sfm_shapefit.base.geometry import UNMOVED, Alignment, rotation_angles_deg
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, in_unit
 from sfm_shapefit.files.colmap.geodesy import earth, enu_of
@@ -188,9 +188,8 @@ def compare_control_points(
             )
         how = f"as the model stands: {fit}"
         warnings += [] if known.why_too_few() else [how]
-        same = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
         known = replace(known, is_check=np.ones(len(known.names), dtype=np.bool_))
-        fit = ControlFit(same, ~known.is_check, 0.0, found.positions - known.positions, np.nan)
+        fit = ControlFit(UNMOVED, ~known.is_check, 0.0, found.positions - known.positions, np.nan)
     else:
         own, alignment = found.positions[fit.fitting], fit.motion.facts
         moved = float(np.linalg.norm((fit.motion.apply(own) - own).mean(axis=0)))

@@ -21,6 +21,7 @@ from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.structure import Structure
+from sfm_shapefit.tracks.filter import keypoint_offsets_px
 
 _MOST_FIELDS = 4  # lenses that are shown; those with most images say most
 _MOST_IMAGES = 150  # images of a lens that are asked, evenly picked; more cost time and add no digit
@@ -118,16 +119,15 @@ def _by_lens(images: Images, chosen: IntArray) -> dict[str, list[int]]:
 def _residuals_of(structure: Structure, chosen: Sequence[int], rows_of: Sequence[IntArray]) -> _Residuals:
     """Return the residuals of chosen images, by the observations of each."""
     points, images, pictures = structure[:3]
-    seen, rotations, centers = points.points_seen(), images.rotations, images.centers
     parts = [_Residuals(np.zeros(0, np.int64), *np.zeros((3, 0, 2)))]
-    for k, (image, rows) in enumerate(zip(chosen, rows_of, strict=True)):
+    of_images = keypoint_offsets_px(points, images, pictures, zip(chosen, rows_of, strict=True))
+    for k, (image, (pixels, offsets_px)) in enumerate(zip(chosen, of_images, strict=True)):
         lens = images.lenses[images.lens_of[image]]
-        pixels, size = pictures.pixels(image, points.keypoints[rows]), np.array([lens.width, lens.height])
-        found = pictures.project(image, (points.xyz[seen[rows]] - centers[image]) @ rotations[image].T)
-        offsets, middle = -lens.offsets_px(found, pixels), size / 2.0
-        arms = pixels - (middle if lens.is_panorama else lens.split_parameters()[1])
-        every = _Residuals(np.full(len(rows), k), pixels / np.maximum(size, 1), arms, offsets)
-        parts.append(every.taken(np.isfinite(offsets).all(axis=1) & bool(size.all())))
+        size = np.array([lens.width, lens.height])
+        arms = pixels - (size / 2.0 if lens.is_panorama else lens.split_parameters()[1])
+        every = _Residuals(np.full(len(pixels), k), pixels / np.maximum(size, 1), arms, -offsets_px)
+        is_usable = np.isfinite(offsets_px).all(axis=1) & bool(size.all())
+        parts.append(every.taken(np.asarray(is_usable)))
     return _Residuals(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 

@@ -16,7 +16,7 @@ from sfm_shapefit.adjustment.scale_bars import fit_scale_bars
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
+from sfm_shapefit.base.geometry import UNMOVED, Similarity, angle_between, compose, median_spread
 from sfm_shapefit.facts.joined_cameras import JoinedGroup, JoinInputs, tell_joined
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.map_result import JoinedModel
@@ -33,8 +33,6 @@ from sfm_shapefit.placement.gauge_rule import gauge_of_distances, resized_gauge
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
 from sfm_shapefit.placement.prior_join import join_to_earlier, try_priors
 from sfm_shapefit.scene.given import PositionPriors
-
-_SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
 
 
 def judge_joins(
@@ -89,8 +87,7 @@ class _Growing:
 
     def __init__(self, piece: ModelPiece, number: int) -> None:
         reconstruction = piece.model.reconstruction
-        same = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
-        self.group = JoinedGroup(reconstruction, {number: same}, ())
+        self.group = JoinedGroup(reconstruction, {number: UNMOVED}, ())
         self.ids: dict[int, Mapping[int, int]] = {number: {i: i for i in reconstruction.point3D_ids()}}
         """New ids of each piece's points, by the old ones."""
 
@@ -147,7 +144,7 @@ def tell_group(
 ) -> JoinedModel:
     """Return joined models, judged as `check` does; `source` has the matches of their images."""
     first, located = next(iter(group.world_from)), join_inputs.located
-    gauge = Gauge(scale="input", similarity=_SAME, statement="input: those of the first model")
+    gauge = Gauge(scale="input", similarity=UNMOVED, statement="input: those of the first model")
     if first in located:
         gauge, group = _choose_scale(group, located[first].gauge, join_inputs)
     model = read_model(group.reconstruction)

@@ -4,11 +4,12 @@ In this order: observations that their camera does not see or that miss by too m
 than two; points without triangulation angle (a point that is not finite has none); short tracks.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import batch_ranges
@@ -44,17 +45,32 @@ def keypoint_errors_px(
 
     Not `ahead`: points behind a camera are projected too, as the formula of its lens has it.
     """
-    errors, seen = np.empty(len(points.images)), points.points_seen()
-    rotations, centers = images.rotations, images.centers
-    for k, rows in enumerate(points.rows_of_images(images.num_images)):
-        with np.errstate(invalid="ignore"):  # a point that is not finite
-            in_camera = (points.xyz[seen[rows]] - centers[k]) @ rotations[k].T
-        found, pixels = (
-            pictures.project(k, in_camera, ahead=ahead),
-            pictures.pixels(k, points.keypoints[rows]),
-        )
-        errors[rows] = np.linalg.norm(images.lenses[images.lens_of[k]].offsets_px(found, pixels), axis=1)
+    errors, rows_of = np.empty(len(points.images)), points.rows_of_images(images.num_images)
+    of_images = keypoint_offsets_px(points, images, pictures, enumerate(rows_of), ahead=ahead)
+    for rows, (_, offsets_px) in zip(rows_of, of_images, strict=True):
+        errors[rows] = np.linalg.norm(offsets_px, axis=1)
     return errors
+
+
+def keypoint_offsets_px(
+    points: Points,
+    images: Images,
+    pictures: KeypointRays,
+    observed: Iterable[tuple[int, IntArray]],
+    *,
+    ahead: bool = True,
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield the pixels (k, 2) of some observations (k,) of each image, and the offsets of these (k, 2).
+
+    An offset leads from the keypoint to where its point is projected, as in `keypoint_errors_px`.
+    """
+    seen, rotations, centers = points.points_seen(), images.rotations, images.centers
+    for image, rows in observed:
+        with np.errstate(invalid="ignore"):  # a point that is not finite
+            in_camera = (points.xyz[seen[rows]] - centers[image]) @ rotations[image].T
+        found = pictures.project(image, in_camera, ahead=ahead)
+        pixels = pictures.pixels(image, points.keypoints[rows])
+        yield pixels, images.lenses[images.lens_of[image]].offsets_px(found, pixels)
 
 
 def _are_wide(points: Points, centers: FloatArray, least_deg: float) -> BoolArray:
