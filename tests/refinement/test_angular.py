@@ -198,7 +198,7 @@ def test_the_metric_is_the_inverse_of_covariance_and_level():
     a = np.random.default_rng(0).standard_normal((graph.num_edges, 2, 2))
     covariance = a @ a.transpose(0, 2, 1)
     information = information_at(MeasuredGraph(graph, covariance=covariance), np.array([0.3]))
-    bases = angular.tangent_bases(graph.directions)
+    bases = tangent_bases(graph.directions)
     inside = bases.transpose(0, 2, 1) @ information @ bases
     np.testing.assert_allclose(
         inside @ (covariance + 0.09 * np.eye(2)), np.tile(np.eye(2), (10, 1, 1)), atol=1e-9
