@@ -14,6 +14,7 @@ from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import batch_ranges
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.structure_options import StructureOptions
 
 
@@ -28,7 +29,7 @@ def filter_points(
         pictures: of these.
         options: what points must satisfy.
     """
-    errors_px = keypoint_errors_px(points, images, pictures)
+    errors_px = keypoint_errors_px(Structure(points, images, pictures))
     fitting = points.paired(errors_px <= options.max_reprojection_error_px)  # false for NaN
     kept = points.taken(fitting)
     sums = np.bincount(kept.points_seen(), errors_px[fitting], kept.num_points)
@@ -38,39 +39,32 @@ def filter_points(
     return kept.taken(is_kept[kept.points_seen()])
 
 
-def keypoint_errors_px(
-    points: Points, images: Images, pictures: KeypointRays, *, ahead: bool = True
-) -> FloatArray:
+def keypoint_errors_px(structure: Structure, *, ahead: bool = True) -> FloatArray:
     """Return the distance of each observation from its point's projection, (o,); NaN where that is not seen.
 
     Not `ahead`: points behind a camera are projected too, as the formula of its lens has it.
     """
-    errors, rows_of = np.empty(len(points.images)), points.rows_of_images(images.num_images)
-    of_images = keypoint_offsets_px(points, images, pictures, enumerate(rows_of), ahead=ahead)
-    for rows, (_, offsets_px) in zip(rows_of, of_images, strict=True):
+    errors, observed = np.empty(len(structure.points.images)), list(enumerate(structure.rows_of_images))
+    of_images = keypoint_offsets_px(structure, observed, ahead=ahead)
+    for (_, rows), offsets_px in zip(observed, of_images, strict=True):
         errors[rows] = np.linalg.norm(offsets_px, axis=1)
     return errors
 
 
 def keypoint_offsets_px(
-    points: Points,
-    images: Images,
-    pictures: KeypointRays,
-    observed: Iterable[tuple[int, IntArray]],
-    *,
-    ahead: bool = True,
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield the pixels (k, 2) of some observations (k,) of each image, and the offsets of these (k, 2).
+    structure: Structure, observed: Iterable[tuple[int, IntArray]], *, ahead: bool = True
+) -> Iterator[FloatArray]:
+    """Yield the offsets (k, 2) of some observations (k,) of each image.
 
     An offset leads from the keypoint to where its point is projected, as in `keypoint_errors_px`.
     """
+    points, images, pictures = structure.points, structure.images, structure.pictures
     seen, rotations, centers = points.points_seen(), images.rotations, images.centers
     for image, rows in observed:
         with np.errstate(invalid="ignore"):  # a point that is not finite
             in_camera = (points.xyz[seen[rows]] - centers[image]) @ rotations[image].T
         found = pictures.project(image, in_camera, ahead=ahead)
-        pixels = pictures.pixels(image, points.keypoints[rows])
-        yield pixels, images.lenses[images.lens_of[image]].offsets_px(found, pixels)
+        yield images.lenses[images.lens_of[image]].offsets_px(found, structure.pixels[rows])
 
 
 def _are_wide(points: Points, centers: FloatArray, least_deg: float) -> BoolArray:
