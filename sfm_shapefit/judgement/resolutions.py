@@ -46,11 +46,12 @@ def recognize_sizes(sizes_px: FloatArray, database_px: FloatArray) -> Recognized
 def recognize_resolution(points: Points, images: Images, pictures: KeypointRays) -> Recognized | None:
     """Return by what factors observations are scaled; None if by none that explains their errors."""
     seen, rows_of, found = points.points_seen(), points.rows_of_images(images.num_images), []
+    rotations, centers, sizes_px = images.rotations, images.centers, images.sizes_px
     for k in range(0, images.num_images, -(-images.num_images // _MOST_IMAGES)):
-        rows, size = rows_of[k], images.sizes_px[k]
-        in_camera = (points.xyz[seen[rows]] - images.centers[k]) @ images.rotations[k].T
+        rows = rows_of[k]
+        in_camera = (points.xyz[seen[rows]] - centers[k]) @ rotations[k].T
         both = np.stack([pictures.pixels(k, points.keypoints[rows]), pictures.project(k, in_camera)], axis=1)
-        found.append(np.append(both, np.broadcast_to(size, (len(rows), 1, 2)), axis=1))
+        found.append(np.append(both, np.broadcast_to(sizes_px[k], (len(rows), 1, 2)), axis=1))
     pixels, projected, sizes = np.concatenate(found).transpose(1, 0, 2)
     far = (projected > _FAR * sizes) & (projected < sizes)  # false for NaN
     if not far.any(axis=0).all():
@@ -76,10 +77,12 @@ def recognize_resolution(points: Points, images: Images, pictures: KeypointRays)
 def find_outside(images: Images, points: Points, pictures: KeypointRays) -> Iterator[OddImages]:
     """Yield the images of lenses more than 1 % of whose observations are outside the picture."""
     outside, every = np.zeros((2, len(images.lenses)))
+    sizes_px = images.sizes_px
+    is_asked = images.is_posed & (sizes_px > 0).all(axis=1)
     for k, rows in enumerate(points.rows_of_images(images.num_images)):
-        if len(rows) and images.is_posed[k] and (images.sizes_px[k] > 0).all():
+        if len(rows) and is_asked[k]:
             pixels = pictures.pixels(k, points.keypoints[rows])
-            is_out = (pixels < -FITTING_PX) | (pixels > images.sizes_px[k] + FITTING_PX)
+            is_out = (pixels < -FITTING_PX) | (pixels > sizes_px[k] + FITTING_PX)
             outside[images.lens_of[k]] += np.count_nonzero(is_out.any(axis=1))
             every[images.lens_of[k]] += len(rows)
     shares = (outside / np.maximum(every, 1))[images.lens_of]
