@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
-from sfm_shapefit.base.executors import in_ranges
+from sfm_shapefit.base.executors import in_ranges, in_threads
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.lists import RowLists
@@ -43,6 +43,7 @@ _WIDTH = 2.0  # standard deviations of Cauchy's loss; see Holland and Welsch (19
 _LEAST_DETERMINANT = 1e-12  # determinant of A over its trace cubed; below, the others do not hold a point
 _LEAST_PIVOT = 1e-13  # pivot of a unit diagonal; rounding leaves as much where nothing determines an unknown
 _LEAST_NOISE = 1e-4  # pixels squared; exact points have none, but bend to what is wrong elsewhere
+_AT_ONCE = 50_000  # observations through one lens whose rays are made together
 _LEAST_FREE = 5e-6  # free share; exactly flat scenes have less, wrong lenses in true ones from 1e-5 on
 
 
@@ -92,7 +93,7 @@ def leave_one_out(
         seen = np.bincount(points.points_seen(), asked[points.images], points.num_points) > 0.0
         rows = seen[points.points_seen()]
         points = points.taken(rows)
-    points, rays, on_plane = _look(replace(structure, points=points), structure.pixels[rows])
+    points, rays, on_plane = _look(replace(structure, points=points), structure.pixels[rows], threads)
     of_images = RowLists.by_label(points.images, n)
     given = (
         points.xyz, points.offsets, points.images, points.points_seen(), rays, on_plane, of_images.rows,
@@ -107,7 +108,7 @@ def leave_one_out(
     return LeftOut(counts, *figures.T)
 
 
-def _look(structure: Structure, pixels: FloatArray) -> tuple[Points, FloatArray, FloatArray]:
+def _look(structure: Structure, pixels: FloatArray, threads: int) -> tuple[Points, FloatArray, FloatArray]:
     """Return the points with the observations that have a ray, these (o, 3), and their places.
 
     Observations are at `pixels` (o, 2). Rays are of length 1 and in camera axes; a place (o, 2) is that in a
@@ -115,16 +116,21 @@ def _look(structure: Structure, pixels: FloatArray) -> tuple[Points, FloatArray,
     """
     points, images = structure.points, structure.images
     rays, places = np.zeros((len(pixels), 3)), np.zeros((len(pixels), 2))
-    for lens, rows in enumerate(RowLists.by_label(images.lens_of[points.images], len(images.lenses))):
-        if not len(rows):
-            continue
-        own = normalized(structure.pictures.rays(int(points.images[rows[0]]), pixels[rows]))
+
+    def look(rows: IntArray) -> None:
+        image = int(points.images[rows[0]])
+        own = normalized(structure.pictures.rays(image, pixels[rows]))
         with np.errstate(divide="ignore", invalid="ignore"):
             stretch = 1.0 / own[:, 2]
-            if images.lenses[lens].is_angular:
+            if images.lenses[images.lens_of[image]].is_angular:
                 across = np.hypot(own[:, 0], own[:, 1])
                 stretch = np.where(across > 0.0, np.arctan2(across, own[:, 2]) / across, 1.0)
-            rays[rows], places[rows] = own, own[:, :2] * stretch[:, None]
+        rays[rows], places[rows] = own, own[:, :2] * stretch[:, None]
+
+    of_lenses = RowLists.by_label(images.lens_of[points.images], len(images.lenses))
+    parts = (rows[k : k + _AT_ONCE] for rows in of_lenses for k in range(0, len(rows), _AT_ONCE))
+    for _ in in_threads(threads, look, parts):
+        pass
     has_ray = np.asarray(np.isfinite(rays).all(axis=1))
     if has_ray.all():
         return points, rays, places

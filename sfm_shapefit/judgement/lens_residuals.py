@@ -66,7 +66,7 @@ def lens_fields(structure: Structure) -> tuple[LensField, ...]:
     found = []
     for label, members in sorted(groups.items(), key=lambda group: -len(group[1]))[:_MOST_FIELDS]:
         chosen = members[:: -(-len(members) // _MOST_IMAGES)]
-        residuals = _residuals_of(structure, chosen, list(rows_of.subset(np.array(chosen))))
+        residuals = _residuals_of(structure, np.array(chosen))
         if len(residuals.images) >= _FEWEST_RESIDUALS:
             width, height = images.sizes_px[members[0]].tolist()
             field = _average(label, width / height, _without_large(residuals))
@@ -101,19 +101,23 @@ def _by_lens(images: Images, chosen: IntArray) -> dict[str, list[int]]:
     return groups
 
 
-def _residuals_of(structure: Structure, chosen: Sequence[int], rows_of: Sequence[IntArray]) -> _Residuals:
-    """Return the residuals of chosen images, by the observations of each."""
-    images, parts = structure.images, [_Residuals(np.zeros(0, np.int64), *np.zeros((3, 0, 2)))]
-    observed = list(zip(chosen, rows_of, strict=True))
-    of_images = zip(observed, keypoint_offsets_px(structure, observed), strict=True)
-    for k, ((image, rows), offsets_px) in enumerate(of_images):
-        lens, pixels = images.lenses[images.lens_of[image]], structure.pixels[rows]
-        size = np.array([lens.width, lens.height])
-        arms = pixels - (size / 2.0 if lens.is_panorama else lens.split_parameters()[1])
-        every = _Residuals(np.full(len(pixels), k), pixels / np.maximum(size, 1), arms, -offsets_px)
-        is_usable = np.isfinite(offsets_px).all(axis=1) & bool(size.all())
-        parts.append(every.taken(np.asarray(is_usable)))
-    return _Residuals(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+def _residuals_of(structure: Structure, chosen: IntArray) -> _Residuals:
+    """Return the residuals of chosen images."""
+    lenses, lens_of = structure.images.lenses, structure.images.lens_of[chosen]
+    observed, sizes = structure.rows_of_images.subset(chosen), structure.images.sizes_px[chosen]
+    middles = [
+        np.array([lens.width, lens.height]) / 2.0 if lens.is_panorama else lens.split_parameters()[1]
+        for lens in lenses
+    ]
+    offsets_px = np.concatenate([found for _, found in keypoint_offsets_px(structure, chosen)])
+    pixels = structure.pixels[observed.rows]
+    every = _Residuals(
+        observed.list_of_rows(),
+        pixels / observed.spread(np.maximum(sizes, 1)),
+        pixels - observed.spread(np.array([middles[lens] for lens in lens_of.tolist()])),
+        -offsets_px,
+    )
+    return every.taken(np.isfinite(offsets_px).all(axis=1) & observed.spread(np.asarray(sizes.all(axis=1))))
 
 
 def _without_large(residuals: _Residuals) -> _Residuals:

@@ -46,11 +46,12 @@ def recognize_resolution(structure: Structure) -> Recognized | None:
     """Return by what factors observations are scaled; None if by none that explains their errors."""
     points, images, pictures = structure.points, structure.images, structure.pictures
     seen, rows_of, found = points.points_seen(), list(structure.rows_of_images), []
+    rotations, centers, sizes_px = images.rotations, images.centers, images.sizes_px
     for k in range(0, images.num_images, -(-images.num_images // _MOST_IMAGES)):
-        rows, size = rows_of[k], images.sizes_px[k]
-        in_camera = (points.xyz[seen[rows]] - images.centers[k]) @ images.rotations[k].T
+        rows = rows_of[k]
+        in_camera = (points.xyz[seen[rows]] - centers[k]) @ rotations[k].T
         both = np.stack([pictures.pixels(k, points.keypoints[rows]), pictures.project(k, in_camera)], axis=1)
-        found.append(np.append(both, np.broadcast_to(size, (len(rows), 1, 2)), axis=1))
+        found.append(np.append(both, np.broadcast_to(sizes_px[k], (len(rows), 1, 2)), axis=1))
     pixels, projected, sizes = np.concatenate(found).transpose(1, 0, 2)
     far = (projected > _FAR * sizes) & (projected < sizes)  # false for NaN
     if not far.any(axis=0).all():

@@ -31,7 +31,12 @@ def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:
 
 
 def tie_images(
-    view: View, fits: PairFits, structure: Structure, fixed: BoolArray | None, tied_pairs: IntArray | None
+    view: View,
+    fits: PairFits,
+    structure: Structure,
+    fixed: BoolArray | None,
+    tied_pairs: IntArray | None,
+    threads: int = 1,
 ) -> tuple[IntArray, tuple[UntiedGroup, ...]]:
     """Return what each image (i,) is tied to, by number, and the groups that hardly anything ties to it.
 
@@ -45,17 +50,17 @@ def tie_images(
     def images_of(inside: BoolArray) -> tuple[str, ...]:
         return images.names_of(np.flatnonzero(inside[frames] & images.is_posed))
 
-    fitting = keypoint_errors_px(structure) <= FITTING_PX
-    rays = Rays(points.points_seen(), frames[points.images], fitting)
+    fitting = keypoint_errors_px(structure, threads=threads) <= FITTING_PX
+    rays = Rays(points.points_seen(), frames[points.images], fitting).of_three()
     pairs = links_of_pairs(*(frames[side] for side in fits.sides))
     known = [] if fixed is None else [frames[rigid_strip(images, fixed)]]
     if tied_pairs is not None:
         tied = frames[tied_pairs]
         known.append(tied[tied[:, 0] != tied[:, 1]])
     together = np.concatenate([np.zeros((0, 2), dtype=np.int64), *known])
-    group = rigid_groups(len(images.frames.ids), rays, together)
+    group = rigid_groups(len(images.frames.ids), rays, together, threads)
     lost = lost_points(view, structure, fitting, group[frames])
-    rays = rays._replace(fits=fitting & ~lost[rays.points])
+    rays = rays._replace(fits=rays.fits & ~lost[rays.points])
     tied, groups = find_groups(group, rays, pairs, images_of)
     posed, of = distinct(frames[images.is_posed]), tied[frames]
     if 2 * np.bincount(tied[posed]).max(initial=0) < len(posed):

@@ -57,7 +57,7 @@ def gather_evidence(
     if source.has_database and structure.has_keypoints_of(source.view):
         duplicates = find_split_duplicates(structure, fits.directions, source.view, threads)
         odd = (*odd, *duplicates, *find_outside(structure))
-    tied, untied = tie_images(source.view, fits, structure, source.fixed, source.tied)
+    tied, untied = tie_images(source.view, fits, structure, source.fixed, source.tied, threads)
     cuts, seams = find_cuts(*fits.sides, tied), tuple[GroupApart, ...]()
     if cuts:  # which are seams by the rotations that pairs across have by themselves
         across = np.concatenate([cut.contradicting for cut in cuts])
