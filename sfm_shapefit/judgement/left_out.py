@@ -43,7 +43,7 @@ _WIDTH = 2.0  # standard deviations of Cauchy's loss; see Holland and Welsch (19
 _LEAST_DETERMINANT = 1e-12  # determinant of A over its trace cubed; below, the others do not hold a point
 _LEAST_PIVOT = 1e-13  # pivot of a unit diagonal; rounding leaves as much where nothing determines an unknown
 _LEAST_NOISE = 1e-4  # pixels squared; exact points have none, but bend to what is wrong elsewhere
-_AT_ONCE = 50_000  # observations through one lens whose rays are made together
+_AT_ONCE = 50_000  # observations through one lens whose rays are made together; their arrays take 6 MB
 _LEAST_FREE = 5e-6  # free share; exactly flat scenes have less, wrong lenses in true ones from 1e-5 on
 
 
