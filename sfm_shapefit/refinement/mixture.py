@@ -160,7 +160,7 @@ class _Residuals(NamedTuple):
 
     locations: FloatArray
     lengths: FloatArray  # (m,) floored
-    logs: FloatArray  # (m,) of the lengths, less their mean
+    logs: FloatArray  # (m,) logs of these, less their mean
     units: FloatArray  # (m, d) directions of the baselines
     across: FloatArray  # (m, d, d - 1) axes of the covariances, less what of them is along the baselines
     errors: FloatArray  # (m, d - 1) along these axes, radians
