@@ -305,6 +305,20 @@ def _residuals(graph: ViewGraph, t: FloatArray) -> FloatArray:
     return np.asarray(units - graph.directions)
 
 
+@inner_kernel
+def _invert(a: Any) -> None:
+    """Replace a positive definite matrix by its inverse (Gauss and Jordan's elimination)."""
+    for p in range(len(a)):
+        pivot, a[p, p] = a[p, p], 1.0
+        for k in range(len(a)):
+            a[p, k] /= pivot
+        for i in range(len(a)):
+            if i != p:
+                factor, a[i, p] = a[i, p], 0.0
+                for k in range(len(a)):
+                    a[i, k] -= factor * a[p, k]
+
+
 @kernel
 def _inform(begin: int, end: int, covariance: Any, v: Any, level: Any, out: Any) -> None:
     """Write B (Sigma + level^2 I)^-1 B^T + m v v^T of the pairs begin..end-1, B as of `tangent_bases`.
@@ -326,15 +340,7 @@ def _inform(begin: int, end: int, covariance: Any, v: Any, level: Any, out: Any)
             for q in range(d - 1):
                 inverse[p, q] = covariance[e, p, q] if is_known else 0.0
             inverse[p, p] += level[e] ** 2
-        for p in range(d - 1):  # Gauss and Jordan's elimination, in place
-            pivot, inverse[p, p] = inverse[p, p], 1.0
-            for q in range(d - 1):
-                inverse[p, q] /= pivot
-            for a in range(d - 1):
-                if a != p:
-                    pivot, inverse[a, p] = inverse[a, p], 0.0
-                    for q in range(d - 1):
-                        inverse[a, q] -= pivot * inverse[p, q]
+        _invert(inverse)
         for p in range(d - 1):
             mean += inverse[p, p] / (d - 1)
         for a in range(d):
