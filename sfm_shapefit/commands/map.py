@@ -133,7 +133,7 @@ def measure_run(run: MapContext) -> tuple[MapContext, RelativeRotations, Videos,
         if known.differ_in_rays(run.images):
             run = run._replace(images=known)
             relative = run.measure()
-    videos = run.find_videos(relative)
+    run, videos = run.with_measured_turns(relative), run.find_videos(relative)
     run, relative, loops = run.judge_loops(videos, relative)
     return run.score_pairs(relative), relative, videos, loops
 

@@ -120,7 +120,7 @@ def _locate_component(
     return replace(
         result,
         scores=run.scores.of(members[result.directions.pairs]),
-        suspicions=(*result.suspicions, *_suspicions(averaging)),
+        suspicions=(*result.suspicions, *run.suspicions, *_suspicions(averaging)),
     )
 
 
