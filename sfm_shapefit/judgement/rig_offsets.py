@@ -12,6 +12,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.geometry import angle_between_deg, mean_rotation_l1, normalized, rotation_angles_deg
+from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import ALIKE_DEG, FEWEST_ALIKE, KNOWN_DEG, RIVAL_SHARE
 from sfm_shapefit.judgement.reasons import Kind
@@ -62,14 +63,29 @@ def measured_offsets(images: Images, directions: PairDirections) -> FloatArray:
     return translations
 
 
-def measured_turns(images: Images, relative: RelativeRotations) -> FloatArray:
+def turn_sensors(images: Images, relative: RelativeRotations) -> tuple[Images, str]:
+    """Turn sensors in their rigs as matches inside frames do that contradict these; and say which, a clause.
+
+    A sensor turns about its own center. One that shares no matches with the reference stays.
+    """
+    sensors = images.sensors
+    rotations = _measure_turns(images, relative)
+    turns = rotations @ sensors.rotations.transpose(0, 2, 1)
+    turned = np.flatnonzero((rotations != sensors.rotations).any(axis=(1, 2))).tolist()
+    if not turned:
+        return images, ""
+    told = [f"camera {images.lenses[k].id} by {rotation_angles_deg(turns[k]):.0f} degrees" for k in turned]
+    clause = f"matches inside frames turn {first_of(told)} from where the rig has it, and are followed"
+    return images.with_sensors(rotations, np.einsum("lab,lb->la", turns, sensors.translations)), clause
+
+
+def _measure_turns(images: Images, relative: RelativeRotations) -> FloatArray:
     """Return the rotations (l, 3, 3) of sensors_from_rig, contradicted ones as matches inside frames say.
 
-    An angle through a lens is known as well as its focal length. A sensor that shares no matches with the
-    reference stays.
+    An angle is known as well as the focal length of the lens that it is seen through.
     """
     sensors, rotations = images.sensors, images.sensors.rotations.copy()
-    focal_sigmas = np.array([lens.sigmas[FOCAL] if lens.sigmas else 0.0 for lens in images.lenses])
+    focal_sigmas = [lens.sigmas[FOCAL] for lens in images.lenses if lens.sigmas]
     inside = np.flatnonzero((np.ptp(images.frame_of[relative.pairs], axis=1) == 0) & relative.are_sound())
     lenses = images.lens_of[relative.pairs[inside]]
     for side in (0, 1):
@@ -79,7 +95,7 @@ def measured_turns(images: Images, relative: RelativeRotations) -> FloatArray:
             turns = relative.rotations[rows] if side == 0 else relative.rotations[rows].transpose(0, 2, 1)
             mean, given = mean_rotation_l1(turns), sensors.rotations[lens]
             alike = rotation_angles_deg(turns.transpose(0, 2, 1) @ mean) <= ALIKE_DEG
-            limit = ALIKE_DEG + focal_sigmas.max() * rotation_angles_deg(given)
+            limit = ALIKE_DEG + max(focal_sigmas, default=0.0) * rotation_angles_deg(given)
             is_known = alike.sum() >= max(FEWEST_ALIKE, RIVAL_SHARE * len(rows))
             if is_known and rotation_angles_deg(given.T @ mean) > limit:
                 rotations[lens] = mean

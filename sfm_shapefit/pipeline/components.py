@@ -10,8 +10,6 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import rotation_angles_deg
-from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.result import Inputs
@@ -20,8 +18,6 @@ from sfm_shapefit.files.colmap.database_images import UnposedImages, read_images
 from sfm_shapefit.files.colmap.database_pairs import refuse_no_features
 from sfm_shapefit.files.colmap.known import read_known
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
-from sfm_shapefit.judgement.rig_offsets import measured_turns
 from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.pair_scores import MOST_SCORED_PAIRS, PairScores, score_repetition
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
@@ -108,8 +104,8 @@ class MapContext(NamedTuple):
     """Pairs that are taken for unmatched."""
     scores: PairScores = PairScores()
     """Scores of pairs of images."""
-    suspicions: tuple[Reason, ...] = ()
-    """Why the models are to be looked at, whatever their pairs say."""
+    suspicions: tuple[str, ...] = ()
+    """Why the models are to be looked at, whatever their pairs say, a clause each."""
     memory_plan: MemoryPlan = MEMORY_PLANS[0]
     """What is given up for memory where the matches of all images are read."""
 
@@ -157,28 +153,6 @@ class MapContext(NamedTuple):
         kept = ~np.isin(np.arange(len(relative.pairs)), verdict.refused)
         without = self.without | {(min(pair), max(pair)) for pair in refused}
         return self._replace(without=without), relative.subset(kept), verdict.loops
-
-    def with_measured_turns(self, relative: RelativeRotations) -> "MapContext":
-        """Return the run with sensors turned in their rigs, and free, where matches inside frames say so."""
-        sensors = self.images.sensors
-        rotations = measured_turns(self.images, relative)
-        turned_deg = rotation_angles_deg(sensors.rotations.transpose(0, 2, 1) @ rotations)
-        turned = np.flatnonzero((rotations != sensors.rotations).any(axis=(1, 2))).tolist()
-        if not turned:
-            return self
-        told = [f"camera {self.images.lenses[k].id} by {turned_deg[k]:.0f} degrees" for k in turned]
-        clause = f"matches inside frames turn {first_of(told)} from where the rig has it, and are followed"
-        # A sensor turns about its own center.
-        turns = rotations @ sensors.rotations.transpose(0, 2, 1)
-        images = self.images.with_sensors(rotations, np.einsum("lab,lb->la", turns, sensors.translations))
-        freedom = self.options.freedom
-        if freedom.adjusts_cameras(images.num_images):
-            freedom = replace(freedom, rigs="free")
-        return self._replace(
-            images=images,
-            options=replace(self.options, freedom=freedom),
-            suspicions=(of_model(Kind.INPUT, clause),),
-        )
 
     def score_pairs(self, relative: RelativeRotations) -> "MapContext":
         """Return the run with the scores by which pairs of repeated structure are told."""

@@ -17,9 +17,9 @@ from sfm_shapefit.files.colmap.intrinsics import calibrated_focals
 from sfm_shapefit.files.colmap.lenses import is_bogus
 from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
-from sfm_shapefit.judgement.evidence import ModelEvidence, OddImages, OpenShape
+from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape
 from sfm_shapefit.judgement.flights import find_flights
-from sfm_shapefit.judgement.lens_residuals import find_bent_lenses
+from sfm_shapefit.judgement.lens_residuals import find_bent_lenses, lens_fields
 from sfm_shapefit.judgement.lenses import find_changed_lenses, find_odd_lenses
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, SMALLEST_SHAPE
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
@@ -49,18 +49,18 @@ def gather_evidence(
 
     Images and `fits`, those of all pairs, are at the rotations of the model; None if no pair has a direction.
     """
-    points, images, pictures, among, asked = structure
-    _, lenses = question_lenses(points, images, pictures, threads, among, images_to_ask(images, asked))
+    images = structure.images
+    _, lenses = question_lenses(structure, threads, images_to_ask(images, structure.asked))
     bogus = np.array([is_bogus(lens) for lens in images.lenses], dtype=np.bool_)
-    odd = (*find_odd_lenses(images, points, pictures, bogus), *find_bent_lenses(structure))
-    odd = (*odd, *find_flights(images))
+    fields = lens_fields(structure)
+    odd = (*find_odd_lenses(structure, bogus), *find_bent_lenses(fields, images.names), *find_flights(images))
     if fits is None:
-        return ModelEvidence(lenses=lenses, odd=odd)
+        return ModelEvidence(lenses=lenses, odd=odd, fields=fields)
     odd = (*odd, *find_contradicted_rigs(images, fits.directions))
     if source.has_database and structure.has_keypoints_of(source.view):
-        given = images, points, pictures, fits.directions, source.view
-        odd = (*odd, *find_split_duplicates(*given, threads), *find_outside(images, points, pictures))
-    tied, untied = tie_images(source.view, fits, structure, source.fixed, source.tied)
+        duplicates = find_split_duplicates(structure, fits.directions, source.view, threads)
+        odd = (*odd, *duplicates, *find_outside(structure))
+    tied, untied = tie_images(source.view, fits, structure, source.fixed, source.tied, threads)
     cuts, seams = find_cuts(*fits.sides, tied), tuple[GroupApart, ...]()
     if cuts:  # which are seams by the rotations that pairs across have by themselves
         across = np.concatenate([cut.contradicting for cut in cuts])
@@ -81,6 +81,7 @@ def gather_evidence(
         untied=tuple(one for one in untied if 2 * len(apart.intersection(one.images)) < len(one.images)),
         num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)) + num_unasked,
         sides=(int(fits.agrees.sum()), int(fits.contradicts.sum())),
+        fields=fields,
     )
 
 
@@ -100,8 +101,7 @@ def question(state: ModelState, clock: Clock) -> ModelEvidence:
     source = replace(source, tied=_tied_by_priors(state, images))
     found, gauge = gather_evidence(source, fits, structure, clock.threads), state.gauge
     places = (one.moved(gauge.similarity.scale, gauge.axes) for one in found.places)
-    known = ask_known_lenses(source, state.images)
-    return replace(found, places=tuple(places), odd=(*found.odd, *known))
+    return with_known_lenses(replace(found, places=tuple(places)), source, state.images)
 
 
 def confirm_by_pixels(state: ModelState) -> BoolArray:
@@ -119,12 +119,12 @@ def confirm_by_pixels(state: ModelState) -> BoolArray:
     return images.are_named(ask_pixels(source, Structure(state.points, images, pictures), names))
 
 
-def ask_known_lenses(source: MatchSource, images: Images) -> tuple[OddImages, ...]:
-    """Return the images whose focal lengths are far from those that were given, or that a database knows."""
+def with_known_lenses(evidence: ModelEvidence, source: MatchSource, images: Images) -> ModelEvidence:
+    """Return the evidence with focal lengths that are far from those given, or known to a database."""
     matches, lenses = source.matches, enumerate(images.lenses)
     known_px = calibrated_focals(matches.file, images) if isinstance(matches, DatabaseMatches) else {}
     known_px |= {k: one.as_given().focal_px for k, one in lenses if one.origin is Origin.CALIBRATION}
-    return tuple(find_changed_lenses(images, known_px))
+    return replace(evidence, odd=(*evidence.odd, *find_changed_lenses(images, known_px)))
 
 
 def with_left_out(state: ModelState) -> Images:
@@ -216,11 +216,10 @@ def ask_pixels(source: MatchSource, structure: Structure, doubted: Collection[st
 
     There are none where the model has other keypoints than the matches.
     """
-    points, images, pictures = structure[:3]
-    view = source.view
+    images, view = structure.images, source.view
     if not (doubted and structure.has_keypoints_of(view)):
         return frozenset()
     rows = images.are_named(doubted)
     links = list(view.links(chosen=np.asarray(rows[view.pairs].any(axis=1))))
-    sure = are_confirmed(points, images, pictures, rows, (view.num_keypoints, links))
+    sure = are_confirmed(structure, rows, (view.num_keypoints, links))
     return frozenset(images.names_of(np.flatnonzero(sure)))

@@ -28,7 +28,6 @@ from sfm_shapefit.files.pair_list import read_pair_list
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.placement.gauge_options import KnownDistance, Scale
 from sfm_shapefit.placement.memory_plan import MEMORY_PLANS, MemoryPlan
-from sfm_shapefit.scene.freedom import RigFreedom
 from sfm_shapefit.scene.given import NOTHING_KNOWN, Known
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import Matches, PairNames, View
@@ -121,11 +120,6 @@ class RunInputs:
     def without_positions(self) -> "RunInputs":
         """Return the same where nothing is known of positions but what rigs say."""
         return replace(self, scale="unit", distances=(), known=NOTHING_KNOWN)
-
-    def with_rigs(self, rigs: RigFreedom) -> "RunInputs":
-        """Return the same with the poses of sensors held, or free."""
-        freedom = replace(self.options.freedom, rigs=rigs)
-        return replace(self, options=replace(self.options, freedom=freedom))
 
 
 def open_matches(model: ColmapModel, inputs: Inputs) -> tuple[DatabaseMatches | TrackMatches, Inputs]:

@@ -29,6 +29,7 @@ from sfm_shapefit.pipeline.stages import run_stages
 from sfm_shapefit.pipeline.starts import begin_model
 from sfm_shapefit.placement.gauge import UselessPriorsError
 from sfm_shapefit.placement.place import ContradictedOffsetsError
+from sfm_shapefit.scene.freedom import RigFreedom
 from sfm_shapefit.scene.lens import FOCAL, Origin
 
 _OPEN_SCALE = 0.5  # relative standard deviation; with a larger one the offsets may as well be 0
@@ -139,7 +140,7 @@ def _run_with_other_offsets(
     is_moved = (offsets != images.sensors.translations).any()
     may_free = freedom.adjusts_cameras(images.num_images)
     for is_free in (True, False) if is_moved and may_free else (False,) * bool(is_moved):
-        start = with_offsets(inputs.with_rigs("free" if is_free else "held"), source, offsets)
+        start = with_offsets(_with_rigs(inputs, "free" if is_free else "held"), source, offsets)
         result = _run_in_scale(*start, clock)
         if isinstance(result, LocateResult):
             doubt = f"{wrong[0]}, so sensors are placed by these matches, as far away as the rig has them"
@@ -148,7 +149,7 @@ def _run_with_other_offsets(
     if isinstance(why, OpenSensorError):
         if not inputs.is_component:
             raise why
-        start, note = (inputs.with_rigs("held"), source), f"the sensors of rigs are held: {why.reason}"
+        start, note = (_with_rigs(inputs, "held"), source), f"the sensors of rigs are held: {why.reason}"
         return *start, _run(*start, clock), (note,)
     longest, length, placement = _longest_offset(inputs), why.length, why.placement
     if not (longest > 0.0 and (length > -_SHORT or measure_hold(placement).scale_sigma > _OPEN_SCALE)):
@@ -160,6 +161,12 @@ def _run_with_other_offsets(
     start = at_one_center(inputs, source)
     note = f"{next(iter(wrong), short)}, so the sensors of a rig are taken to share one center"
     return *start, _run(*start, clock), (note,)
+
+
+def _with_rigs(inputs: RunInputs, rigs: RigFreedom) -> RunInputs:
+    """Return the same with the poses of sensors held, or free."""
+    freedom = replace(inputs.options.freedom, rigs=rigs)
+    return replace(inputs, options=replace(inputs.options, freedom=freedom))
 
 
 def at_one_center(inputs: RunInputs, source: MatchSource) -> tuple[RunInputs, MatchSource]:

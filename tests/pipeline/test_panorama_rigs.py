@@ -217,7 +217,7 @@ def test_map_follows_the_matches_that_contradict_a_rig_and_says_so(tmp_path, tur
     (finding,) = found.verdict.findings
     assert told in finding.sentence
     assert found.verdict.grade == "look"
-    assert_right(found.reconstruction, truth, metric=True)
+    assert_right(found.reconstruction, truth, most=0.01, metric=True)
 
 
 def test_sensors_that_share_a_center_turn_but_stay_there_if_rigs_are_free(six):
