@@ -77,7 +77,7 @@ def make_model(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateRe
         UnsolvableError: if no camera can be placed.
     """
     result, notes = _run_in_scale(inputs, source, clock), tuple[str, ...]()
-    if not isinstance(result, LocateResult):
+    if not isinstance(result, LocateResult) or _contradicts_rigs(result, inputs):
         inputs, source, result, notes = _run_with_other_offsets(result, inputs, source, clock)
     for remedy in find_remedies(result, inputs, source):
         again = _run(remedy.inputs, remedy.source, clock)
@@ -122,8 +122,21 @@ def _longest_offset(inputs: RunInputs) -> float:
     return float(np.linalg.norm(inputs.images.sensors.translations, axis=1).max(initial=0.0))
 
 
+def _contradicts_rigs(result: LocateResult, inputs: RunInputs) -> bool:
+    """Return whether matches inside frames put a sensor elsewhere in its rig, of which nothing is fixed."""
+    may_be = inputs.images.has_rigs and not inputs.fixed.any()
+    return may_be and any(find_contradicted_rigs(result.images, result.directions))
+
+
+def _loses(result: LocateResult, before: object) -> bool:
+    return isinstance(before, LocateResult) and bool(result.kept.sum() < before.kept.sum())
+
+
 def _run_with_other_offsets(
-    why: ContradictedOffsetsError | OpenSensorError, inputs: RunInputs, source: MatchSource, clock: Clock
+    why: LocateResult | ContradictedOffsetsError | OpenSensorError,
+    inputs: RunInputs,
+    source: MatchSource,
+    clock: Clock,
 ) -> tuple[RunInputs, MatchSource, LocateResult, tuple[str, ...]]:
     """Return what to start from in place of sensors that fail, what comes of it, and a note.
 
@@ -142,10 +155,12 @@ def _run_with_other_offsets(
     for is_free in (True, False) if is_moved and may_free else (False,) * bool(is_moved):
         start = with_offsets(_with_rigs(inputs, "free" if is_free else "held"), source, offsets)
         result = _run_in_scale(*start, clock)
-        if isinstance(result, LocateResult):
+        if isinstance(result, LocateResult) and not _loses(result, why):
             doubt = f"{wrong[0]}, so sensors are placed by these matches, as far away as the rig has them"
             suspicions = (*result.suspicions, of_model(Kind.INPUT, doubt))
             return *start, replace(result, suspicions=suspicions), ()
+    if isinstance(why, LocateResult):
+        return inputs, source, why, ()
     if isinstance(why, OpenSensorError):
         if not inputs.is_component:
             raise why
