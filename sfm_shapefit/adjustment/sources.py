@@ -1,7 +1,7 @@
 """Where points come from: the matches of images, or the points of a model with the same keypoints."""
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from sfm_shapefit.base.arrays import (
     distinct,
     stable_order,
 )
-from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.executors import in_threads, overlapped
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images, KeypointRays
@@ -27,7 +27,7 @@ from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
 Links = MatchedKeypoints | ObservedTracks
 """Matches, from which tracks are joined anew at each pose; or the tracks of a model."""
 
-_MATCHES_A_SLICE = 1_000_000  # matches renumbered at once; more would take a second array of all
+_MATCHES_A_SLICE = 250_000  # matches renumbered at once; more would take a second array of all
 
 
 def collect_matches(
@@ -36,6 +36,7 @@ def collect_matches(
     place: IntArray,
     batches: Iterable[KeypointMatches],
     num_matches: int,
+    threads: int = 1,
 ) -> MatchedKeypoints:
     """Return all matches between posed images; batches are consumed one at a time.
 
@@ -45,38 +46,33 @@ def collect_matches(
         place: (n,) row in `images` of each image that the batches' pairs index; -1 for those to be left out.
         batches: matches.
         num_matches: that the batches have at most.
-
-    Raises:
-        InputError: if a match refers to a keypoint that its image does not have.
+        threads: number of threads to share batches among; the answer does not depend on it.
     """
     counts = np.array([pictures.count(k) for k in range(images.num_images)], dtype=np.int64)
     begins = offsets_of(counts)
     number = np.uint32 if begins[-1] < 2**32 else np.int64
     # Memory is taken as rows are written; one array of each batch, to be joined, would take it twice.
-    room, end = np.empty((num_matches, 2), dtype=number), 0
-    is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
-    for batch in batches:
-        kept = (place[batch.pairs] >= 0).all(axis=1)
-        lengths, own = batch.lengths(), batch.keypoints
+    room, is_matched = np.empty((num_matches, 2), dtype=number), np.zeros(int(begins[-1]), dtype=np.bool_)
+
+    def tasks() -> Iterator[tuple[KeypointMatches, BoolArray, int]]:
+        end = 0
+        for batch in batches:
+            kept = np.asarray((place[batch.pairs] >= 0).all(axis=1))
+            yield batch, kept, end
+            end += int(batch.lengths()[kept].sum())
+
+    def enter(task: tuple[KeypointMatches, BoolArray, int]) -> int:
+        batch, kept, begin = task
+        ends, lengths, own = place[batch.pairs], batch.lengths(), batch.keypoints
         if not kept.all():
-            lengths, own = lengths[kept], own[np.repeat(kept, lengths)]
-        ends = place[batch.pairs[kept]]
-        missing = (own >= np.repeat(counts[ends], lengths, axis=0)).any(axis=1)
-        if missing.any():
-            pair = ends[np.repeat(np.arange(len(ends)), lengths)[np.argmax(missing)]]
-            names = " and ".join(images.names[k] for k in pair.tolist())
-            raise InputError(
-                f"the pair {names} has matches of keypoints that do not exist; match the images again"
-            )
-        numbers = room[end : end + len(own)]
-        numbers[:] = own + np.repeat(begins[ends], lengths, axis=0)
+            ends, lengths, own = ends[kept], lengths[kept], own.compress(np.repeat(kept, lengths), axis=0)
+        numbers = room[begin : begin + len(own)]
+        np.add(own, np.repeat(begins[ends], lengths, axis=0), out=numbers, casting="unsafe")
         is_matched[numbers] = True
-        end += len(own)
-    row_of = np.cumsum(is_matched, dtype=number)
-    for first in range(0, end, _MATCHES_A_SLICE):
-        numbers = room[first : min(first + _MATCHES_A_SLICE, end)]
-        numbers[:] = row_of[numbers] - 1
-    del row_of
+        return begin + len(own)
+
+    end = max(overlapped(threads, enter, tasks()), default=0)
+    _renumber(room[:end], is_matched, threads)
     parts = [np.flatnonzero(part).astype(np.int32) for part in np.split(is_matched, begins[1:-1])]
     taken = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
     keypoints = np.concatenate(parts)
@@ -84,6 +80,19 @@ def collect_matches(
     return MatchedKeypoints(
         cameras=cameras, keypoints=keypoints, pixels=pixels, on_plane=on_plane, matches=room[:end]
     )
+
+
+def _renumber(keypoints: npt.NDArray[np.integer], chosen: BoolArray, threads: int) -> None:
+    """Replace numbers (m, 2) of chosen keypoints by their rows among these, in place."""
+    row_of = np.cumsum(chosen, dtype=keypoints.dtype)
+    row_of -= 1
+
+    def replace_some(first: int) -> None:
+        some = keypoints[first : first + _MATCHES_A_SLICE]
+        some[:] = row_of.take(some)
+
+    for _ in in_threads(threads, replace_some, range(0, len(keypoints), _MATCHES_A_SLICE)):
+        pass
 
 
 def collect_tracks(images: Images, pictures: KeypointRays, points: Points) -> ObservedTracks:

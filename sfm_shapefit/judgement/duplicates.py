@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct
 from sfm_shapefit.base.executors import in_ranges
 from sfm_shapefit.base.jit import inner_kernel, kernel
-from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, FEWEST_POINTS, LOCAL_SHARE, RIVAL_SHARE
 from sfm_shapefit.judgement.reasons import Kind
@@ -76,11 +75,11 @@ def _find_duplicates(
 
 def _places(images: Images, pictures: KeypointRays, batch: KeypointMatches, side: int) -> FloatArray:
     """Return where the matches of pairs are in their first or second image, (M, 2), in its widths."""
-    places = np.empty((len(batch.keypoints), 2))
-    for image, rows in enumerate(RowLists.by_label(batch.spread(batch.pairs[:, side]))):
-        if len(rows):
-            width = max(images.lenses[images.lens_of[image]].width, 1)
-            places[rows] = pictures.pixels(image, batch.keypoints[rows, side]) / width
+    places, own = np.empty((len(batch.keypoints), 2)), batch.pairs[:, side]
+    for image in distinct(own).tolist():
+        rows = batch.rows_of(np.flatnonzero(own == image)).rows
+        width = max(images.lenses[images.lens_of[image]].width, 1)
+        places[rows] = pictures.pixels(image, batch.keypoints[rows, side]) / width
     return places
 
 

@@ -198,7 +198,9 @@ class ModelState:
             images.part(rows), lambda k: view.keypoints(chosen[k]), view.num_keypoints[rows]
         )
 
-    def read_links(self, images: Images, advance: Advance, *, rejected: bool = False) -> Links:
+    def read_links(
+        self, images: Images, advance: Advance, threads: int = 1, *, rejected: bool = False
+    ) -> Links:
         """Return what joins the keypoints of posed images, or matches of rejected pairs; rays are forgotten.
 
         From here to the end of a triangulation, or an adjustment, most memory is needed.
@@ -213,4 +215,6 @@ class ModelState:
         links = view.links(chosen=wanted, advance=advance, consume=True)
         place = np.full(images.num_images, -1)
         place[rows] = np.arange(len(rows))
-        return collect_matches(posed, pictures, place, links, view.num_matches)
+        collected = collect_matches(posed, pictures, place, links, view.num_matches, threads)
+        view.give_back()  # pixels that were looked up
+        return collected

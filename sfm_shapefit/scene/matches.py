@@ -108,7 +108,7 @@ class Reading(NamedTuple):
     rays_bytes: int = 1_000_000_000
     """Bytes of the rays of keypoints that are kept for the next pair."""
     keeps: bool = True
-    """Whether matches that were read are kept."""
+    """Whether matches and keypoints that were read are kept."""
 
 
 PLENTY = Reading()
@@ -136,6 +136,8 @@ class Matches(ABC):
     notes: Sequence[str] = ()
     """What of the file was read otherwise than it stands there, a sentence each."""
 
+    keeps: bool = True
+    """Whether keypoints that were read may be kept, as the last view had it."""
     lacking: str = ""
     """What was left aside of the input where no images share matches; empty if nothing was."""
 
@@ -150,6 +152,7 @@ class Matches(ABC):
             left_out: pairs that are taken for unmatched.
             reading: how much memory may be taken; where nothing is kept, what earlier views keep goes, too.
         """
+        self.keeps = reading.keeps
         if not reading.keeps:
             self.forget()
             for earlier in self._views:

@@ -956,7 +956,7 @@ def test_rows_are_looked_up_in_the_order_of_their_ids(tmp_path):
         written.executemany("INSERT INTO squares VALUES (?, ?)", ((k, k * k) for k in range(len(rowids))))
         written.commit()
     with contextlib.closing(sqlite_file.DatabaseFile(tmp_path / "database.db")) as file:
-        assert file.look_up("squares", "square", rowids) == [(k * k,) for k in rowids]
+        assert file.look_up("squares", "square", rowids) == [k * k for k in rowids]
 
 
 @pytest.mark.parametrize("kind", ["memory", "bin", "txt"])

@@ -115,13 +115,12 @@ class DatabaseFile:
         with _sqlite_errors(self.path):
             return self.connection.execute(statement, values).fetchall()
 
-    def look_up(self, table: str, columns: str, rowids: Sequence[int]) -> list[tuple[Any, ...]]:
-        """Return columns of rows that a table has, in the order of their ids; errors as of `query`."""
-        found: dict[int, tuple[Any, ...]] = {}
+    def look_up(self, table: str, column: str, rowids: Sequence[int]) -> list[Any]:
+        """Return a column of rows that a table has, in the order of their ids; errors as of `query`."""
+        found = dict[int, Any]()
         for first in range(0, len(rowids), _AT_ONCE):
             some = ", ".join(map(str, rowids[first : first + _AT_ONCE]))
-            rows = self.query(f"SELECT rowid, {columns} FROM {table} WHERE rowid IN ({some})")
-            found.update((row[0], row[1:]) for row in rows)
+            found.update(self.query(f"SELECT rowid, {column} FROM {table} WHERE rowid IN ({some})"))
         return [found[rowid] for rowid in rowids]
 
     def rows(self, table: str, queries: dict[tuple[str, ...], str]) -> list[tuple[Any, ...]]:
