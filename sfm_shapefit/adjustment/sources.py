@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,7 @@ from sfm_shapefit.base.executors import in_threads, overlapped
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images, KeypointRays
-from sfm_shapefit.scene.matches import KeypointMatches
+from sfm_shapefit.scene.matches import KeypointMatches, lens_runs
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
 
@@ -76,7 +77,7 @@ def collect_matches(
     parts = [np.flatnonzero(part).astype(np.int32) for part in np.split(is_matched, begins[1:-1])]
     taken = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
     keypoints = np.concatenate(parts)
-    cameras, pixels, on_plane = _look_up(images, pictures, taken, keypoints)
+    cameras, pixels, on_plane = _look_up(images, pictures, taken, keypoints, threads)
     return MatchedKeypoints(
         cameras=cameras, keypoints=keypoints, pixels=pixels, on_plane=on_plane, matches=room[:end]
     )
@@ -95,10 +96,13 @@ def _renumber(keypoints: npt.NDArray[np.integer], chosen: BoolArray, threads: in
         pass
 
 
-def collect_tracks(images: Images, pictures: KeypointRays, points: Points) -> ObservedTracks:
+def collect_tracks(
+    images: Images, pictures: KeypointRays, points: Points, threads: int = 1
+) -> ObservedTracks:
     """Return the tracks of points that posed images observe; they keep the points' ids and order."""
     order = stable_order(points.images)
-    cameras, pixels, on_plane = _look_up(images, pictures, points.images[order], points.keypoints[order])
+    own = points.images[order], points.keypoints[order]
+    cameras, pixels, on_plane = _look_up(images, pictures, *own, threads)
     back = stable_order(points.points_seen()[order])
     return ObservedTracks(
         offsets=points.offsets,
@@ -147,17 +151,22 @@ def _on_plane(rays: FloatArray) -> FloatArray:
 
 
 def _look_up(
-    images: Images, pictures: KeypointRays, of: IntArray | Int32Array, keypoints: IntArray | Int32Array
+    images: Images,
+    pictures: KeypointRays,
+    of: IntArray | Int32Array,
+    keypoints: IntArray | Int32Array,
+    threads: int,
 ) -> tuple[Int32Array, npt.NDArray[np.floating], FloatArray]:
     """Return camera, pixels (m, 2) and x/z, y/z (m, 2) of keypoints; the images that they are `of` ascend."""
-    cameras = np.searchsorted(views_of(images).images, of).astype(np.int32)
-    on_plane = np.empty((len(of), 2))
-    seen: npt.NDArray[np.floating] = np.zeros((len(of), 2), dtype=np.float32)  # until 32 bits do not do
-    ends = np.searchsorted(of, np.arange(images.num_images + 1)).tolist()
-    for k, (begin, end) in enumerate(itertools.pairwise(ends)):
-        own, lens = slice(begin, end), images.lenses[images.lens_of[k]]
-        pixels = pictures.pixels(k, keypoints[own])
-        rays = pictures.rays(k, pixels)
+    first_cameras, ends = views_of(images).images, np.searchsorted(of, np.arange(images.num_images + 1))
+    cameras, on_plane = np.empty(len(of), dtype=np.int32), np.empty((len(of), 2))
+
+    def look(seen: npt.NDArray[np.floating], run: tuple[int, int]) -> bool:
+        slices = [slice(*pair) for pair in itertools.pairwise(ends[run[0] : run[1] + 1].tolist())]
+        own, lens = slice(slices[0].start, slices[-1].stop), images.lenses[images.lens_of[run[0]]]
+        pixels = np.concatenate([pictures.pixels(k, keypoints[one]) for k, one in enumerate(slices, run[0])])
+        rays = pictures.rays(run[0], pixels)
+        cameras[own] = np.searchsorted(first_cameras, of[own])
         if lens.is_plane:
             on_plane[own] = rays[:, :2] / rays[:, 2:]
         else:
@@ -167,7 +176,13 @@ def _look_up(
             if not lens.is_adjustable:
                 pixels = lens.focal_px * on_plane[own]
             cameras[own] += view
-        if not np.array_equal(pixels.astype(seen.dtype), pixels, equal_nan=True):
-            seen = seen.astype(np.float64)
         seen[own] = pixels
+        return np.array_equal(seen[own], pixels, equal_nan=True)
+
+    runs = lens_runs(images.lens_of, np.diff(ends))
+    seen: npt.NDArray[np.floating] = np.empty((len(of), 2), dtype=np.float32)
+    if not all(in_threads(threads, partial(look, seen), runs)):  # 32 bits do not do
+        seen = np.empty((len(of), 2))
+        for _ in in_threads(threads, partial(look, seen), runs):
+            pass
     return cameras, seen, on_plane

@@ -120,8 +120,9 @@ def _residuals_of(structure: Structure, chosen: Sequence[int], rows_of: Sequence
     """Return the residuals of chosen images, by the observations of each."""
     points, images, pictures = structure[:3]
     parts = [_Residuals(np.zeros(0, np.int64), *np.zeros((3, 0, 2)))]
-    of_images = keypoint_offsets_px(points, images, pictures, zip(chosen, rows_of, strict=True))
-    for k, (image, (pixels, offsets_px)) in enumerate(zip(chosen, of_images, strict=True)):
+    find_offsets = keypoint_offsets_px(points, images, pictures)
+    for k, (image, rows) in enumerate(zip(chosen, rows_of, strict=True)):
+        pixels, offsets_px = find_offsets({image: rows})
         lens = images.lenses[images.lens_of[image]]
         size = np.array([lens.width, lens.height])
         arms = pixels - (size / 2.0 if lens.is_panorama else lens.split_parameters()[1])

@@ -85,7 +85,7 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
         counts = PartnerCounts(images, view.num_keypoints, limit_px, state.source.fixed)
         partners = _count(links, images, counts)
         del links
-        points = filter_points(points, posed, state.pictures(images, rows), options.structure)
+        points = filter_points(points, posed, state.pictures(images, rows), options.structure, clock.threads)
     if bundle is not None:
         assert points.errors_px is not None
         final = replace(bundle.solves, final_error_px=float(points.errors_px.mean()))

@@ -208,7 +208,7 @@ class ModelState:
         view, rows = self.source.view, images.posed_rows
         pictures, posed = self.pictures(images, rows), images.part(rows)
         if isinstance(self.source.matches, TrackMatches):  # the model has its tracks already
-            return collect_tracks(posed, pictures, self.source.matches.points_of(posed))
+            return collect_tracks(posed, pictures, self.source.matches.points_of(posed), threads)
         wanted = is_among(view.pairs, self.placement.rejected_pairs) == rejected
         if self.among is not None:
             wanted &= np.isin(view.pairs, self.among).all(axis=1)
