@@ -17,7 +17,7 @@ from sfm_shapefit.base.arrays import (
     distinct,
     stable_order,
 )
-from sfm_shapefit.base.executors import in_threads, overlapped
+from sfm_shapefit.base.executors import in_slices, in_threads, overlapped
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images, KeypointRays
@@ -88,12 +88,10 @@ def _renumber(keypoints: npt.NDArray[np.integer], chosen: BoolArray, threads: in
     row_of = np.cumsum(chosen, dtype=keypoints.dtype)
     row_of -= 1
 
-    def replace_some(first: int) -> None:
-        some = keypoints[first : first + _MATCHES_A_SLICE]
-        some[:] = row_of.take(some)
+    def replace_some(begin: int, end: int) -> None:
+        keypoints[begin:end] = row_of.take(keypoints[begin:end])
 
-    for _ in in_threads(threads, replace_some, range(0, len(keypoints), _MATCHES_A_SLICE)):
-        pass
+    in_slices(threads, len(keypoints), _MATCHES_A_SLICE, replace_some)
 
 
 def collect_tracks(

@@ -160,7 +160,7 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
     results = 350.0 * work.num_pairs + 3000.0 * work.num_images
     is_sorted = plan.reading.keeps and work.num_matches <= MOST_MATCHES
     in_memory = MATCH_BYTES * work.num_matches if is_sorted else 0.0
-    if plan.reading.keeps and work.num_keypoints <= MOST_KEYPOINTS:
+    if work.num_keypoints <= MOST_KEYPOINTS:
         in_memory += PIXEL_BYTES * work.num_keypoints
     throughout = _STARTED_BYTES + _KERNELS_BYTES + model + rays + results + in_memory
     reading = _STARTED_BYTES + 30e6 + _READ_BYTES * work.num_keypoints

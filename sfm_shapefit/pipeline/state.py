@@ -215,6 +215,4 @@ class ModelState:
         links = view.links(chosen=wanted, advance=advance, consume=True)
         place = np.full(images.num_images, -1)
         place[rows] = np.arange(len(rows))
-        collected = collect_matches(posed, pictures, place, links, view.num_matches, threads)
-        view.give_back()  # pixels that were looked up
-        return collected
+        return collect_matches(posed, pictures, place, links, view.num_matches, threads)

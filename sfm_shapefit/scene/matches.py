@@ -34,7 +34,9 @@ from sfm_shapefit.scene.lens import Lens
 PairNames = frozenset[tuple[str, str]]
 """Pairs of images by their names, the smaller name first."""
 
-_OBSERVATIONS_A_RUN = 50_000  # observations whose rays are computed at once
+_OBSERVATIONS_A_RUN = 50_000  # observations seen through one lens; the arrays of so many take 4 MB
+    50_000  # observations, seen through one lens, that are looked at together; they take 4 MB
+)
 KEPT_MATCHES = 1_000_000  # matches that are kept with their rays; they take 80 MB
 # Matches of a database; of more, none is kept while points are made of them. To read 30 million again takes a
 # twentieth of the time of a run, and to keep them an eighth of its memory.
@@ -109,7 +111,7 @@ class Reading(NamedTuple):
     rays_bytes: int = 1_000_000_000
     """Bytes of the rays of keypoints that are kept for the next pair."""
     keeps: bool = True
-    """Whether matches and keypoints that were read are kept."""
+    """Whether matches that were read are kept."""
 
 
 PLENTY = Reading()
@@ -137,8 +139,6 @@ class Matches(ABC):
     notes: Sequence[str] = ()
     """What of the file was read otherwise than it stands there, a sentence each."""
 
-    keeps: bool = True
-    """Whether keypoints that were read may be kept, as the last view had it."""
     lacking: str = ""
     """What was left aside of the input where no images share matches; empty if nothing was."""
 
@@ -153,7 +153,6 @@ class Matches(ABC):
             left_out: pairs that are taken for unmatched.
             reading: how much memory may be taken; where nothing is kept, what earlier views keep goes, too.
         """
-        self.keeps = reading.keeps
         if not reading.keeps:
             self.forget()
             for earlier in self._views:

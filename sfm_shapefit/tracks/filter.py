@@ -4,90 +4,70 @@ In this order: observations that their camera does not see or that miss by too m
 than two; points without triangulation angle (a point that is not finite has none); short tracks.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.executors import in_threads
-from sfm_shapefit.base.lists import RowLists, offsets_of
-from sfm_shapefit.scene.images import Images, KeypointRays
+from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.matches import batch_ranges, lens_runs
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.structure_options import StructureOptions
 
 
-def filter_points(
-    points: Points,
-    images: Images,
-    pictures: KeypointRays,
-    options: StructureOptions,
-    threads: int = 1,
-) -> Points:
-    """Return the points that satisfy the options, their observations that do, and their errors.
-
-    Args:
-        points: of the images.
-        images: where they stand.
-        pictures: of these.
-        options: what points must satisfy.
-        threads: number of threads to share the observations among; the answer does not depend on it.
-    """
-    errors_px = keypoint_errors_px(points, images, pictures, threads)
+def filter_points(structure: Structure, options: StructureOptions, threads: int = 1) -> Points:
+    """Return the points that satisfy the options, their observations that do, and their errors."""
+    points = structure.points
+    errors_px = keypoint_errors_px(structure, threads=threads)
     fitting = points.paired(errors_px <= options.max_reprojection_error_px)  # false for NaN
     kept = points.taken(fitting)
     sums = np.bincount(kept.points_seen(), errors_px[fitting], kept.num_points)
     kept = replace(kept, errors_px=sums / kept.lengths())
-    is_kept = _are_wide(kept, images.centers, options.min_triangulation_angle_deg, threads)
+    is_kept = _are_wide(kept, structure.images.centers, options.min_triangulation_angle_deg, threads)
     is_kept &= kept.lengths() >= options.min_track_length
     return kept.taken(is_kept[kept.points_seen()])
 
 
-def keypoint_errors_px(
-    points: Points, images: Images, pictures: KeypointRays, threads: int = 1, *, ahead: bool = True
-) -> FloatArray:
+def keypoint_errors_px(structure: Structure, *, ahead: bool = True, threads: int = 1) -> FloatArray:
     """Return the distance of each observation from its point's projection, (o,); NaN where that is not seen.
 
-    Not `ahead`: points behind a camera are projected too, as the formula of its lens has it. Threads share
-    the images.
+    Not `ahead`: points behind a camera are projected too, as the formula of its lens has it.
     """
-    errors, of_images = np.empty(len(points.images)), RowLists.by_label(points.images, images.num_images)
-    find_offsets = keypoint_offsets_px(points, images, pictures, ahead=ahead)
-    slices = of_images.slices()
-
-    def measure(run: tuple[int, int]) -> None:
-        observed = {k: of_images.rows[slices[k]] for k in range(*run)}
-        rows = of_images.rows[slices[run[0]].start : slices[run[1] - 1].stop]
-        errors[rows] = np.linalg.norm(find_offsets(observed)[1], axis=1)
-
-    for _ in in_threads(threads, measure, lens_runs(images.lens_of, of_images.lengths())):
-        pass
+    errors, every = np.empty(len(structure.points.images)), np.arange(structure.images.num_images)
+    for rows, offsets_px in keypoint_offsets_px(structure, every, ahead=ahead, threads=threads):
+        errors[rows] = np.linalg.norm(offsets_px, axis=1)
     return errors
 
 
 def keypoint_offsets_px(
-    points: Points, images: Images, pictures: KeypointRays, *, ahead: bool = True
-) -> Callable[[Mapping[int, IntArray]], tuple[FloatArray, FloatArray]]:
-    """Return what gives the pixels (k, 2) of observations through one lens, and the offsets of these (k, 2).
+    structure: Structure, chosen: IntArray, *, ahead: bool = True, threads: int = 1
+) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Yield the observations (k,) of chosen images, one after the other, some at a time, and their offsets.
 
-    The observations are rows, by image. An offset leads from the keypoint to where its point is projected,
-    as in `keypoint_errors_px`.
+    An offset (k, 2) leads from the keypoint to where its point is projected, as in `keypoint_errors_px`.
     """
-    seen, rotations, centers = points.points_seen(), images.rotations, images.centers
+    points, images, rows_of = structure.points, structure.images, structure.rows_of_images
+    seen, rotations, centers, pixels = (
+        points.points_seen(),
+        images.rotations,
+        images.centers,
+        structure.pixels,
+    )
 
-    def find_offsets(observed: Mapping[int, IntArray]) -> tuple[FloatArray, FloatArray]:
-        in_cameras, seen_px, first = [], [], next(iter(observed))
-        for image, rows in observed.items():
+    def project(some: IntArray) -> tuple[IntArray, FloatArray]:
+        observed, lens = rows_of.subset(some), images.lenses[images.lens_of[some[0]]]
+        in_camera = points.xyz.take(seen.take(observed.rows), axis=0)
+        for image, own in zip(some.tolist(), observed.slices(), strict=True):
             with np.errstate(invalid="ignore"):  # a point that is not finite
-                own = points.xyz.take(seen.take(rows), axis=0) - centers[image]
-                in_cameras.append(own @ rotations[image].T)
-            seen_px.append(pictures.pixels(image, points.keypoints[rows]))
-        found = pictures.project(first, np.concatenate(in_cameras), ahead=ahead)
-        pixels, lens = np.concatenate(seen_px), images.lenses[images.lens_of[first]]
-        return pixels, lens.offsets_px(found, pixels)
+                in_camera[own] = (in_camera[own] - centers[image]) @ rotations[image].T
+        found = structure.pictures.project(int(some[0]), in_camera, ahead=ahead)
+        return observed.rows, lens.offsets_px(found, pixels.take(observed.rows, axis=0))
 
-    return find_offsets
+    runs = lens_runs(images.lens_of[chosen], rows_of.lengths()[chosen])
+    return in_threads(threads, project, (chosen[begin:end] for begin, end in runs))
 
 
 def _are_wide(points: Points, centers: FloatArray, least_deg: float, threads: int) -> BoolArray:

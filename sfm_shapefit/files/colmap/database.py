@@ -36,11 +36,11 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import Matches, Reading, View, batch_ranges
 
-PIXEL_BYTES, MOST_KEYPOINTS = 8, 32_000_000
+PIXEL_BYTES, MOST_KEYPOINTS = 8, 10_000_000
 """Bytes of a keypoint that is kept, and keypoints of a database up to which they are: a run looks at each a
 dozen times."""
 
-_HALF = np.uint64(32)  # bits of a keypoint in the number of a match, see `sorted_matches`
+_HALF = np.uint64(32)  # bits of a keypoint; the number of a match holds two, see `sorted_matches`
 _SURVEYED = 250_000  # matches that are looked at together; as many as are read together later
 
 
@@ -174,7 +174,7 @@ class DatabaseMatches(Matches):
         if name in self._pixels:
             return self._pixels[name]
         pixels = self._read_keypoints(name)
-        if self.keeps and self.total_keypoints <= MOST_KEYPOINTS:
+        if self.total_keypoints <= MOST_KEYPOINTS:
             self._pixels[name] = pixels
         return pixels
 
