@@ -35,8 +35,6 @@ PairNames = frozenset[tuple[str, str]]
 """Pairs of images by their names, the smaller name first."""
 
 _OBSERVATIONS_A_RUN = 50_000  # observations seen through one lens; the arrays of so many take 4 MB
-    50_000  # observations, seen through one lens, that are looked at together; they take 4 MB
-)
 KEPT_MATCHES = 1_000_000  # matches that are kept with their rays; they take 80 MB
 # Matches of a database; of more, none is kept while points are made of them. To read 30 million again takes a
 # twentieth of the time of a run, and to keep them an eighth of its memory.
