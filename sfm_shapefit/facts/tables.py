@@ -31,8 +31,8 @@ from sfm_shapefit.scene.given import EarthDatum
 
 TableName = Literal["cameras", "pairs", "control_points"]
 Column = npt.NDArray[Any]
-_QUOTED = re.compile('[",\r\n]')
-"""What makes a cell stand in quotes."""
+_QUOTED = '",\r\n'
+"""Signs that make a cell stand in quotes."""
 _ROWS_AT_ONCE = 10_000  # rows that are made texts together; those of pairs take 10 MB
 _BYTE = re.compile(r"\\u(dc[89a-f][0-9a-f])")
 
@@ -308,9 +308,9 @@ def write_csv(columns: Mapping[str, Sequence[object] | Column], stream: TextIO) 
     bare.writerow(columns)
     for first in range(0, max(map(len, columns.values())), _ROWS_AT_ONCE):
         cells = [_cells(values[first : first + _ROWS_AT_ONCE]) for values in columns.values()]
-        rows = list(zip(*cells, strict=True))
-        if len(columns) > 1 and not any(_QUOTED.search("\t".join(texts)) for texts in cells):
-            stream.writelines(f"{line}\n" for line in map(",".join, rows))
+        rows, words = zip(*cells, strict=True), "".join(map("".join, cells))
+        if len(columns) > 1 and not any(sign in words for sign in _QUOTED):
+            stream.write("\n".join(map(",".join, rows)) + "\n")
             continue
         for row in rows:  # a carriage return ends a line for others, which `csv` forgets
             (quoted if any("\r" in text for text in row) else bare).writerow(row)

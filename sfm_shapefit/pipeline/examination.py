@@ -1,7 +1,8 @@
 """Ask for evidence that the fit did not use: of our own models, and of any that is looked at."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -10,12 +11,12 @@ from sfm_shapefit.adjustment.open_shape import estimate_open_shape
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.clock import Clock
-from sfm_shapefit.base.executors import nobody
+from sfm_shapefit.base.executors import in_threads, nobody
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.lenses import is_bogus
 from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
-from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape
+from sfm_shapefit.judgement.evidence import LensField, ModelEvidence, OddImages, OpenShape
 from sfm_shapefit.judgement.flights import find_flights
 from sfm_shapefit.judgement.lens_residuals import find_bent_lenses, lens_fields
 from sfm_shapefit.judgement.lenses import find_odd_lenses
@@ -27,7 +28,7 @@ from sfm_shapefit.judgement.seams import GroupApart, find_cuts, find_seams
 from sfm_shapefit.judgement.tied_groups import rigid_strip, tie_images
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.witnesses import are_confirmed
-from sfm_shapefit.judgement.wrong_lenses import question_lenses
+from sfm_shapefit.judgement.wrong_lenses import ContradictedLens, question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.state import ModelState
@@ -47,10 +48,7 @@ def gather_evidence(
     Images and `fits`, those of all pairs, are at the rotations of the model; None if no pair has a direction.
     """
     images = structure.images
-    _, lenses = question_lenses(structure, threads, images_to_ask(images, structure.asked))
-    bogus = np.array([is_bogus(lens) for lens in images.lenses], dtype=np.bool_)
-    fields = lens_fields(structure)
-    odd = (*find_odd_lenses(structure, bogus), *find_bent_lenses(fields, images.names), *find_flights(images))
+    lenses, fields, odd = _ask_points(structure, threads)
     if fits is None:
         return ModelEvidence(lenses=lenses, odd=odd, fields=fields)
     odd = (*odd, *find_contradicted_rigs(images, fits.directions))
@@ -80,6 +78,22 @@ def gather_evidence(
         sides=(int(fits.agrees.sum()), int(fits.contradicts.sum())),
         fields=fields,
     )
+
+
+def _ask_points(
+    structure: Structure, threads: int
+) -> tuple[tuple[ContradictedLens, ...], tuple[LensField, ...], tuple[OddImages, ...]]:
+    """Return what points say of lenses and places, asked side by side once their pixels are read."""
+    images, _ = structure.images, structure.pixels
+    asked, bogus = images_to_ask(images, structure.asked), [is_bogus(lens) for lens in images.lenses]
+    jobs: list[Callable[[], Any]] = [
+        lambda: question_lenses(structure, threads, asked)[1],
+        lambda: tuple(find_odd_lenses(structure, np.array(bogus, dtype=np.bool_))),
+        lambda: lens_fields(structure),
+        lambda: tuple(find_flights(images)),
+    ]
+    lenses, unlike, fields, flying = in_threads(threads, lambda job: job(), jobs)
+    return lenses, fields, (*unlike, *find_bent_lenses(fields, images.names), *flying)
 
 
 def question(state: ModelState, clock: Clock) -> ModelEvidence:
