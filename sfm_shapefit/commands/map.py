@@ -53,7 +53,7 @@ def map_database(
         options: settings, see `help(MapOptions)`; defaults if None.
         **overrides: single options by name: `map_database(database, adjust="full")`.
         progress: called as stages advance.
-        priors: a table of position priors, as of `locate`, or all that files tell, where it has been read.
+        priors: a table of position priors, as of `locate`, or what was read of all files already.
             Components with fewer than two keep the scale "unit", and so do those, with a warning, whose
             priors coincide or contradict the cameras.
         client: of dask.distributed, whose workers share the work, as of `locate`. None: all is done here.
