@@ -74,7 +74,12 @@ def kernel(function: Kernel) -> Kernel:
         raise TypeError(f"kernel {function.__name__} closes over a value; pass it as an argument")
     dispatcher = numba.njit(**_options(function))(function)
     dispatcher._cache = KernelCache(function)
+    dispatcher._compilation_chain_init_hook = _load_no_extensions
     return cast(Kernel, dispatcher)
+
+
+def _load_no_extensions() -> None:
+    """Leave out numba's search of all that is installed for extensions of it, which no kernel needs."""
 
 
 def inner_kernel(function: Kernel) -> Kernel:
