@@ -15,6 +15,7 @@ is another compilation: integers are int64 and arrays writable, or read-only, wh
 literal number has a type of its own.
 """
 
+import ctypes
 import hashlib
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -27,7 +28,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils, targetconfig
 from numba.core.event import install_listener
-from numba.extending import get_cython_function_address, intrinsic, register_jitable
+from numba.extending import intrinsic, register_jitable
 
 from sfm_shapefit.base.kernel_cache import CompileTime, KernelCache, choose_target
 from sfm_shapefit.base.scipy_parts import compiled_module
@@ -55,6 +56,12 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 # calls none of these.
 _MAKE_ARRAYS = {"arange", "array", "empty", "empty_like", "full", "ones", "zeros"}
 
+# What Python offers to read what a Cython module exports.
+_name_of = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", ctypes.pythonapi))
+_pointer_in = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
+    ("PyCapsule_GetPointer", ctypes.pythonapi)
+)
+
 # Four float64 or eight float32: what most processors add at once.
 _LANE_BYTES = 32
 
@@ -74,12 +81,7 @@ def kernel(function: Kernel) -> Kernel:
         raise TypeError(f"kernel {function.__name__} closes over a value; pass it as an argument")
     dispatcher = numba.njit(**_options(function))(function)
     dispatcher._cache = KernelCache(function)
-    dispatcher._compilation_chain_init_hook = _load_no_extensions
     return cast(Kernel, dispatcher)
-
-
-def _load_no_extensions() -> None:
-    """Leave out numba's search of all that is installed for extensions of it, which no kernel needs."""
 
 
 def inner_kernel(function: Kernel) -> Kernel:
@@ -101,8 +103,8 @@ def function_address(module: str, name: str) -> int:
         module: such as "scipy.linalg.cython_blas".
         name: such as "dsyrk".
     """
-    compiled_module(*module.rsplit(".", 1))  # alone; numba would load its package too
-    return int(get_cython_function_address(module, name))
+    capsule = compiled_module(*module.rsplit(".", 1)).__pyx_capi__[name]  # numba would import all of scipy
+    return int(_pointer_in(capsule, _name_of(capsule)))
 
 
 def _call_address(_context: Any, address: Any, pointers: Any) -> Any:

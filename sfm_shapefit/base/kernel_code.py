@@ -10,6 +10,7 @@ from functools import cache
 from typing import Any
 
 import llvmlite.binding as llvm
+from numba.core.caching import CompileResultCacheImpl
 from numba.core.codegen import CodeLibrary, JITCodeLibrary
 from numba.core.compiler import compile_result
 from numba.core.environment import Environment
@@ -20,7 +21,8 @@ from numba.core.serialize import dumps
 def pack(compiled: Any) -> bytes:
     """Return what `unpack` takes, without the text that numba keeps for those who inspect types."""
     own, without = _anchored_here(compiled.environment), compiled._replace(type_annotation="")
-    library, *rest, others = without._replace(environment=own)._reduce()
+    # The methods of numba's class take nothing from an instance, which would look for a folder.
+    library, *rest, others = CompileResultCacheImpl.reduce(None, without._replace(environment=own))
     name, _, (machine_code, llvm_code) = library
     return pickle.dumps((dumps((name, *rest, tuple(map(_anchored_here, others)))), machine_code, llvm_code))
 
@@ -55,7 +57,7 @@ def unpack(content: bytes, target_context: Any) -> Any:
 
 @cache
 def _offer_runtime() -> None:
-    """Tell LLVM where the functions of numba's runtime are that kernels call, without compiling the others."""
+    """Tell LLVM where the functions of numba's runtime are that kernels call; the others are not compiled."""
     for name, address in _nrt_python.c_helpers.items():
         llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 

@@ -10,7 +10,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from threading import Thread
 
-
 _ASKED_FOR_BY_NUMBA = ("scipy", "yaml")
 """Packages that numba imports to see the version of one, and to read a file of settings with the other."""
 
