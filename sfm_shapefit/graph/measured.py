@@ -73,7 +73,8 @@ class MeasuredGraph:
     @property
     def is_pair(self) -> BoolArray:
         """(m,) whether an edge joins two cameras; the others join a camera and a point."""
-        return np.asarray((self.graph.edges < self.num_cameras).all(axis=1))
+        first, second = self.num_cameras > self.graph.edges.T
+        return np.asarray(first & second)
 
     @property
     def pairs(self) -> IntArray:

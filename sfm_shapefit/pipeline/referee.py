@@ -22,7 +22,6 @@ import numpy as np
 
 from sfm_shapefit import __version__
 from sfm_shapefit.adjustment.sources import collect_tracks
-from sfm_shapefit.base.arrays import distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.check_result import CheckResult, OtherModel, checked_camera_rows, checked_pair_rows
@@ -41,7 +40,7 @@ from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.bundle import points_of_pictures
 from sfm_shapefit.pipeline.conventions import ask_convention
-from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence
+from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence, with_known_lenses
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
@@ -98,7 +97,7 @@ def read_structure(state: CheckState, clock: Clock) -> CheckState:
     with clock("points"):
         images = state.images
         structure = structure_of(state.model.arrays, images)
-        quality = image_quality(*structure[:3])
+        quality = image_quality(structure)
         weak = tuple(find_weak_images(state.images, quality))
         return replace(state, structure=structure, quality=quality, weak=weak)
 
@@ -117,6 +116,7 @@ def gather_evidence_against(state: CheckState, clock: Clock) -> CheckState:
     """Gather the evidence as `locate` does, with the open shape where nothing else has measured lenses."""
     source, structure = state.source, state.structure
     evidence = gather_evidence(source, state.fits, structure, clock.threads)
+    evidence = with_known_lenses(evidence, source, state.images)
     if source.inputs.is_made or not source.has_database:
         tracks = collect_tracks(state.images, structure.pictures, structure.points)
         rows = np.arange(state.images.num_images)
@@ -164,7 +164,7 @@ def grade_model(state: CheckState, clock: Clock) -> CheckState:
     if verdict.is_bad and (far := source.inputs.far):
         near = check_source(state.model, source.without(far), state.options, clock.anew()).verdict
         verdict = verdict if near.is_bad else ModelVerdict.weigh(of_alike_pictures(verdict.findings))
-    recognized, fault = recognize_resolution(*state.structure[:3]), None
+    recognized, fault = recognize_resolution(state.structure), None
     if verdict.is_bad and recognized is None:
         fault = verdict.fault_of_input(state.images.num_images)
         recognized = None if fault else ask_convention(source, clock.threads)
@@ -201,7 +201,7 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
         loose_groups=[],
         versions={"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
         mean_reprojection_error_px=float(errors_px.mean()) if len(errors_px) else np.nan,
-        num_lenses=len(distinct(state.images.lens_of)),
+        num_lenses=len(np.unique(state.images.lens_of)),
         median_track_length=_median(quality.point_track_lengths.tolist()),
         residual_level_deg=np.nan if fits is None else fits.level_deg,
         timings_s=clock.seconds,
