@@ -314,6 +314,8 @@ def test_threads_change_no_bit_of_a_factor_with_tasks_and_strips(divided, dtype)
         factor.refactor(w)
     for factor in factors[1:]:
         assert factor.smallest_pivot == factors[0].smallest_pivot
+        many = np.tile(rhs, 7)  # threads share these, and not the tree
+        np.testing.assert_array_equal(factor.solve(many), np.tile(factors[0].solve(rhs), 7))
         np.testing.assert_array_equal(factor.solve(rhs), factors[0].solve(rhs))
     matrix = laplacian_matrix(plan.num_nodes, edges, w)
     residual = np.linalg.norm(matrix @ factors[0].solve(rhs) - rhs) / np.linalg.norm(rhs)
