@@ -141,36 +141,32 @@ array_address = intrinsic(_array_address)
 
 
 def _multiply_in_lanes(
-    _context: Any, panel: Any, _at: Any, _leading: Any, vectors: Any, _start: Any, _count: Any, sums: Any
+    _context: Any, panel: Any, _at: Any, _leading: Any, vector: Any, _start: Any, _count: Any, sums: Any
 ) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         integer = context.get_value_type(types.int64)
         number = context.get_value_type(signature.args[0].dtype)
         size = context.get_abi_sizeof(number)
         lanes = ir.VectorType(number, _LANE_BYTES // size)
-        flat, lines, out = (
+        flat, line, out = (
             context.make_array(signature.args[k])(context, builder, arguments[k]) for k in (0, 3, 6)
         )
         _, at, leading, _, start, count, _ = arguments
-        length = builder.extract_value(lines.shape, 1)
-
-        def place(data: Any, first: Any, stride: Any, k: int) -> Any:
-            return builder.gep(data, [builder.add(first, builder.mul(stride, integer(k)))])
-
-        columns = [place(flat.data, at, leading, q) for q in range(4)]
-        rows = [place(lines.data, start, length, k) for k in range(3)]
+        starts = (builder.add(at, builder.mul(leading, integer(q))) for q in range(4))
+        columns = [builder.gep(flat.data, [first]) for first in starts]
+        row = builder.gep(line.data, [start])
 
         def accumulate(begin: Any, end: Any, kind: Any, step: int) -> list[Any]:
-            totals = [cgutils.alloca_once_value(builder, ir.Constant(kind, None)) for _ in range(12)]
+            totals = [cgutils.alloca_once_value(builder, ir.Constant(kind, None)) for _ in columns]
             with cgutils.for_range_slice(builder, begin, end, integer(step), integer) as (i, _):
 
                 def load(pointer: Any) -> Any:
                     here = builder.bitcast(builder.gep(pointer, [i]), kind.as_pointer())
                     return builder.load(here, align=size)
 
-                factors, values = [load(column) for column in columns], [load(row) for row in rows]
-                products = [builder.fmul(factor, value) for value in values for factor in factors]
-                for total, product in zip(totals, products, strict=True):
+                value = load(row)
+                for total, column in zip(totals, columns, strict=True):
+                    product = builder.fmul(load(column), value)
                     builder.store(builder.fadd(builder.load(total), product), total)
             return [builder.load(total) for total in totals]
 
@@ -188,13 +184,13 @@ def _multiply_in_lanes(
         whole = builder.sub(count, builder.srem(count, integer(lanes.count)))
         vectorial = accumulate(integer(0), whole, lanes, lanes.count)
         rest = accumulate(whole, count, number, 1)
-        for k in range(12):
+        for k in range(4):
             total = builder.fadd(add_lanes(vectorial[k]), rest[k])
             builder.store(total, builder.gep(out.data, [integer(k)]))
         return context.get_dummy_value()
 
     number = types.int64
-    return types.void(panel, number, number, vectors, number, number, sums), generate
+    return types.void(panel, number, number, vector, number, number, sums), generate
 
 
 def _subtract_block(_context: Any, spread: Any, rows: Any, _row: Any, blocks: Any, _block: Any) -> Any:
@@ -234,12 +230,12 @@ def _indices(numbers: Iterable[int]) -> ir.Constant:
 
 
 multiply_in_lanes = intrinsic(_multiply_in_lanes)
-"""In a kernel: the products of four columns with three vectors, summed in lanes of a fixed width.
+"""In a kernel: the products of four columns with a vector, summed in lanes of a fixed width.
 
-`multiply_in_lanes(panel, at, leading, vectors, start, count, sums)` writes to sums[k, q] the sum over i <
-count of panel[at + q leading + i] vectors[k, start + i]. A sum in the written order cannot use the vectors of
-a processor. These sums do, and have one order on all of them. `panel` (.,), `vectors` (3, .) and `sums` (3,
-4) are contiguous and of one type, float32 or float64.
+`multiply_in_lanes(panel, at, leading, vector, start, count, sums)` writes to sums[q] the sum over i < count
+of panel[at + q leading + i] vector[start + i]. A sum in the written order cannot use the vectors of a
+processor. These sums do, and have one order on all of them. `panel` (.,), `vector` (.,) and `sums` (4,) are
+contiguous and of one type, float32 or float64.
 """
 
 
