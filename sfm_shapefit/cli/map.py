@@ -115,7 +115,7 @@ def _match(
     clock = Clock.of(run.progress, run.options.placement.solver.threads)
     begun, notes = begin_database(images, database, read_options(MatchingOptions, given), clock)
     refuse_useless_files(database, run.options, priors)
-    match_begun(begun, clock)
+    match_begun(begun, clock, priors)
     run.flags = replace(run.flags, images=run.flags.images or str(images))
     return notes
 

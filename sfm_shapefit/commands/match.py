@@ -4,16 +4,23 @@ images and lenses -> features -> pairs -> matches and two-view geometries
 """
 
 import json
+import os
 import warnings
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from sfm_shapefit.base.arrays import IntArray, distinct_pairs
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.paths import MASKS, refuse_no_folder
+from sfm_shapefit.base.paths import MASKS, OF_DATABASE, refuse_no_folder
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import flat_values, merge_options
 from sfm_shapefit.base.wording import first_of
+from sfm_shapefit.files.colmap.database_images import read_images
+from sfm_shapefit.files.colmap.known import read_priors
 from sfm_shapefit.files.colmap.photographs import (
     PhotographDatabase,
     find_photographs,
@@ -21,14 +28,18 @@ from sfm_shapefit.files.colmap.photographs import (
     refuse_rigs,
 )
 from sfm_shapefit.files.colmap.picture_matches import read_descriptors
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.matching_options import MATCHING_FILE, MOST_EXHAUSTIVE, MatchingOptions
 from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, alike_pairs
 from sfm_shapefit.scene.sequences import find_sequences
 from sfm_shapefit.solver.solver_options import SolverOptions
 
-_ALIKE, _ALIKE_OF_SEQUENCE = 30, 5
-"""Alike images that each is matched with: as many as COLMAP's retrieval would be asked for, or, where those
-next in a sequence are matched too, what closes its loops."""
+_ALIKE, _ALIKE_BESIDE = 30, 5
+"""Alike images that each is matched with: as many as COLMAP's retrieval would be asked for, or, beside those
+next in a sequence or near in position, what closes loops and finds images without a position."""
+_NEAR_A_STEP = 3
+"""Images near in position for each of `overlap`: thirty reach the next strip of a flight whose images along
+one overlap by 90 % and across by 60 %."""
 
 
 def match_images(
@@ -36,6 +47,7 @@ def match_images(
     database: Path | str,
     *,
     options: MatchingOptions | None = None,
+    priors: Path | str | None = None,
     threads: int = 0,
     progress: Progress | None = None,
     **overrides: Any,
@@ -50,6 +62,8 @@ def match_images(
         database: file to be made. One that an interrupted call left is gone on with, and so is one to which
             images are added.
         options: settings, see `help(MatchingOptions)`; defaults if None.
+        priors: a table of positions, or a folder with EXIF data, for `pairing="spatial"`; without it, the
+            EXIF data of the images.
         threads: 0 for all cores.
         progress: called as stages advance.
         **overrides: single options by name: `match_images(images, database, pairing="sequential")`.
@@ -66,7 +80,7 @@ def match_images(
     options = merge_options(options, MatchingOptions, overrides)
     clock = Clock.of(progress, SolverOptions(threads=threads).threads)
     made, notes = begin_database(Path(images), Path(database), options, clock)
-    match_begun(made, clock)
+    match_begun(made, clock, priors)
     for note in notes:
         warnings.warn(note, stacklevel=2)
     return Path(database)
@@ -101,12 +115,34 @@ def begin_database(
     return made, [f"{why}: {first_of(unused)} in {folder}"] if unused else []
 
 
-def match_begun(made: PhotographDatabase, clock: Clock) -> None:
-    """Write the features and matches that a database of photographs lacks."""
+def match_begun(made: PhotographDatabase, clock: Clock, priors: Path | str | None = None) -> None:
+    """Write the features and matches that a database of photographs lacks; `priors` as of `match_images`."""
+    pairing = _pairing_of(made.known_names(), made.options)
+    near = _near_pairs(made, priors or OF_DATABASE) if pairing == "spatial" else None
     with clock("features"):
         made.detect(clock.advance)
     with clock("matches"):
-        _match(made, _pairing_of(made.known_names(), made.options), clock)
+        if near is not None:
+            made.match_pairs(near, clock.advance)
+        _match(made, pairing, clock)
+
+
+def _near_pairs(made: PhotographDatabase, priors: Path | str) -> IntArray:
+    """Return the pairs (k, 2) of each image and those nearest to it, as rows of the names of the database.
+
+    Altitudes have no part, since those of GPS are off by tens of meters.
+    """
+    from scipy.spatial import KDTree
+
+    with closing(DatabaseFile(made.database)) as file:
+        images = read_images(file).images
+        known = read_priors(images, file, priors).known
+    row_of = {name: row for row, name in enumerate(made.known_names())}
+    rows = np.array([row_of[name] for name in images.names_of(known.indices)])
+    places = known.positions[:, :2]
+    _, near = KDTree(places).query(places, min(_NEAR_A_STEP * made.options.overlap + 1, len(rows)))
+    pairs = np.column_stack([np.repeat(rows, near.shape[1]), rows[near.ravel()]])
+    return distinct_pairs(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1))
 
 
 def _record_of(database: Path) -> Path:
@@ -116,6 +152,7 @@ def _record_of(database: Path) -> Path:
 def _remember(database: Path, options: MatchingOptions) -> None:
     """Write with which options a database is made; InputError if it was begun with others or elsewhere."""
     record, told = _record_of(database), flat_values(options)
+    told |= {name: told[name] and os.path.abspath(told[name]) for name in ("mask_path", "rig_config_path")}
     if not database.exists():
         return write_json(told, record)
     try:
@@ -141,10 +178,10 @@ def _pairing_of(names: list[str], options: MatchingOptions) -> str:
 
 
 def _match(made: PhotographDatabase, pairing: str, clock: Clock) -> None:
-    """Match the pairs of a kind, and those of a sequence that close its loops."""
+    """Match all pairs, or those of a sequence, and those that look alike."""
     if pairing == "exhaustive":
         return made.match_exhaustively(clock.advance)
     if pairing == "sequential":
         made.match_sequentially(clock.advance)
-    most = _ALIKE_OF_SEQUENCE if pairing == "sequential" else _ALIKE
+    most = _ALIKE if pairing == "retrieval" else _ALIKE_BESIDE
     return made.match_pairs(alike_pairs(read_descriptors(made.database, NUM_DESCRIBED), most), clock.advance)

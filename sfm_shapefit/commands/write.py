@@ -159,5 +159,11 @@ def _write_report(found: Any, page: Path, images: Path | str, out: str = "OUT") 
     return write_result_page(found, page, images, out)
 
 
-WRITERS = Writers(_draw_page, write_page, write_result)
+def _length_of(found: Any, first: str | int, second: str | int) -> Any:
+    from sfm_shapefit.commands.lengths import length_of  # here: few ask
+
+    return length_of(found, first, second)
+
+
+WRITERS = Writers(_draw_page, write_page, write_result, _length_of)
 """What `base.display` writes results by."""

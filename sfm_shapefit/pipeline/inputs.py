@@ -13,6 +13,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
+from sfm_shapefit.base.paths import from_here
 from sfm_shapefit.facts.command_options import PlacingOptions, Source
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.result import Inputs
@@ -219,7 +220,7 @@ def inputs_to_check(model: ModelSource, database: Path | str | None) -> Inputs:
     own = _database_of_output(inputs.folder) if inputs.folder and inputs.database is None else None
     if own is None:
         return inputs
-    statement = f"inlier matches of {own} (which the model's locate.json names)"
+    statement = f"inlier matches of {from_here(str(own))} (which the model's locate.json names)"
     return replace(inputs, database=own, statement=statement, is_found=True)
 
 
@@ -227,7 +228,7 @@ def _database_of_output(folder: Path) -> Path | None:
     """Return the database that an output names, if it is there and has all images of it; else None."""
     with suppress(InputError):
         path = told_of(folder, "inputs", lambda found: Path(found.get("database")))
-        if path is not None and path.is_file():
+        if path is not None and path.is_absolute() and path.is_file():
             names = sorted(read_trust(folder / "cameras.csv"))
             with closing(DatabaseFile(path)) as file:
                 return path if {*range(len(names))} <= {*match_names(file, names).values()} else None
