@@ -260,7 +260,7 @@ def test_lengths_that_are_none_are_told(ring):
 
 
 def test_a_result_tells_a_length_as_evaluate_does_whether_it_was_adjusted_or_not(
-    ring, ring_located, ring_mapped
+    ring, ring_located, ring_mapped, tmp_path
 ):
     ends = ("0001.jpg", "0004.jpg")
     plain = sfm_shapefit.locate(ring, RING / "database.db", adjust="none")
@@ -270,7 +270,7 @@ def test_a_result_tells_a_length_as_evaluate_does_whether_it_was_adjusted_or_not
         assert told.length == pytest.approx(np.linalg.norm(centers[0] - centers[1]))
         assert str(told).startswith(f"{told.length:.8f} ± "[:6])
         assert "(95 %)" in str(told)
-    scaled = sfm_shapefit.map_database(RING / "database.db", known_distance=((*ends, 2.5),))
+    scaled = sfm_shapefit.map_database(RING / "database.db", scale_bars=written(tmp_path, lines_of(ring)))
     told = scaled.length(*ends)  # of the largest model, with what it knows of its scale
     assert told.has_scale
     assert told == scaled.models[0].length(*ends)
