@@ -12,7 +12,6 @@ from sfm_shapefit.facts.control_points import compare_control_points
 from sfm_shapefit.facts.lengths import (
     Axes,
     LengthBetween,
-    LengthFacts,
     LengthsFacts,
     errors_of,
     length_between,
@@ -92,14 +91,6 @@ def evaluate_lengths(
             *(f"nothing is known of the error of the distance of {ends}; choose others" for ends in unknown),
         ],
     )
-
-
-def length_of(model: ModelSource, first: str | int, second: str | int) -> LengthFacts:
-    """Return how well the distance of two places of a model is known, as `evaluate_lengths` does."""
-    told = evaluate_lengths(model, [(first, second)])
-    if not told.lengths:
-        raise UnsolvableError(told.warnings[-1])
-    return told.lengths[0].length
 
 
 def _refuse_no_pairs(ends: object) -> None:

@@ -3,8 +3,6 @@
 images and lenses -> features -> pairs -> matches and two-view geometries
 """
 
-import json
-import os
 import warnings
 from contextlib import closing
 from pathlib import Path
@@ -12,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import IntArray, distinct_pairs
+from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.paths import MASKS, OF_DATABASE, refuse_no_folder
-from sfm_shapefit.base.record import write_json
-from sfm_shapefit.base.settings import flat_values, merge_options
+from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.known import read_priors
@@ -26,20 +23,18 @@ from sfm_shapefit.files.colmap.photographs import (
     find_photographs,
     refuse_lens,
     refuse_rigs,
+    remember_options,
 )
 from sfm_shapefit.files.colmap.picture_matches import read_descriptors
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.matching_options import MATCHING_FILE, MOST_EXHAUSTIVE, MatchingOptions
-from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, alike_pairs
+from sfm_shapefit.judgement.chosen_pairs import NEAR_A_STEP, NUM_DESCRIBED, alike_pairs, nearest_pairs
 from sfm_shapefit.scene.sequences import find_sequences
 from sfm_shapefit.solver.solver_options import SolverOptions
 
 _ALIKE, _ALIKE_BESIDE = 30, 5
-"""Alike images that each is matched with: as many as COLMAP's retrieval would be asked for, or, beside those
-next in a sequence or near in position, what closes loops and finds images without a position."""
-_NEAR_A_STEP = 3
-"""Images near in position for each of `overlap`: thirty reach the next strip of a flight whose images along
-one overlap by 90 % and across by 60 %."""
+"""Alike images that each is matched with: as many as COLMAP's retrieval would be asked for, or what closes
+loops beside images next in a sequence or near in position."""
 
 
 def match_images(
@@ -89,10 +84,7 @@ def match_images(
 def begin_database(
     folder: Path, path: Path, options: MatchingOptions, clock: Clock
 ) -> tuple[PhotographDatabase, list[str]]:
-    """Make a database of photographs with images and lenses, and say what the user should know, in sentences.
-
-    Errors are those of `match_images`.
-    """
+    """Make a database with images and lenses; return it and notes for the user. Errors as of `match_images`."""
     refuse_lens(options)
     if options.mask_path:
         refuse_no_folder(Path(options.mask_path), MASKS)
@@ -102,13 +94,13 @@ def begin_database(
         folder=folder, database=path, names=found.names, options=options, threads=clock.threads
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    _remember(path, options)
+    remember_options(path, options)
     with clock("images"):
         unreadable = made.write_images(clock.advance)
         names = made.known_names()
     if len(names) < 2:
         path.unlink()
-        _record_of(path).unlink()
+        path.with_name(MATCHING_FILE).unlink()
         raise InputError(f"{folder} has no two images that pycolmap can read; not {first_of(unreadable)}")
     unused = [*found.unread, *unreadable]
     why = "not used, since pycolmap cannot read them"
@@ -128,44 +120,13 @@ def match_begun(made: PhotographDatabase, clock: Clock, priors: Path | str | Non
 
 
 def _near_pairs(made: PhotographDatabase, priors: Path | str) -> IntArray:
-    """Return the pairs (k, 2) of each image and those nearest to it, as rows of the names of the database.
-
-    Altitudes have no part, since those of GPS are off by tens of meters.
-    """
-    from scipy.spatial import KDTree
-
+    """Return the pairs (k, 2) of each image and those nearest to it, as rows of the names of the database."""
     with closing(DatabaseFile(made.database)) as file:
         images = read_images(file).images
         known = read_priors(images, file, priors).known
     row_of = {name: row for row, name in enumerate(made.known_names())}
     rows = np.array([row_of[name] for name in images.names_of(known.indices)])
-    places = known.positions[:, :2]
-    _, near = KDTree(places).query(places, min(_NEAR_A_STEP * made.options.overlap + 1, len(rows)))
-    pairs = np.column_stack([np.repeat(rows, near.shape[1]), rows[near.ravel()]])
-    return distinct_pairs(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1))
-
-
-def _record_of(database: Path) -> Path:
-    return database.with_name(MATCHING_FILE)
-
-
-def _remember(database: Path, options: MatchingOptions) -> None:
-    """Write with which options a database is made; InputError if it was begun with others or elsewhere."""
-    record, told = _record_of(database), flat_values(options)
-    told |= {name: told[name] and os.path.abspath(told[name]) for name in ("mask_path", "rig_config_path")}
-    if not database.exists():
-        return write_json(told, record)
-    try:
-        before = json.loads(record.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise InputError(
-            f"{database} was not made of images by this program; map it as it is, or choose another place"
-        ) from None
-    if others := [f"{name}={before.get(name)!r}" for name in told if before.get(name) != told[name]]:
-        raise InputError(
-            f"{database} was begun with {', '.join(others)}; give the same options, or another place"
-        )
-    return None
+    return np.sort(rows[nearest_pairs(known.positions, NEAR_A_STEP * made.options.overlap)], axis=1)
 
 
 def _pairing_of(names: list[str], options: MatchingOptions) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_file, atomic_folder
 from sfm_shapefit.base.display import Reported, Writers
-from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
 from sfm_shapefit.commands.colors import Result, with_colors
@@ -160,9 +160,12 @@ def _write_report(found: Any, page: Path, images: Path | str, out: str = "OUT") 
 
 
 def _length_of(found: Any, first: str | int, second: str | int) -> Any:
-    from sfm_shapefit.commands.lengths import length_of  # here: few ask
+    from sfm_shapefit.commands.lengths import evaluate_lengths  # here: few ask
 
-    return length_of(found, first, second)
+    told = evaluate_lengths(found, [(first, second)])
+    if not told.lengths:
+        raise UnsolvableError(told.warnings[-1])
+    return told.lengths[0].length
 
 
 WRITERS = Writers(_draw_page, write_page, write_result, _length_of)

@@ -13,7 +13,6 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
-from sfm_shapefit.base.paths import from_here
 from sfm_shapefit.facts.command_options import PlacingOptions, Source
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.result import Inputs
@@ -220,7 +219,7 @@ def inputs_to_check(model: ModelSource, database: Path | str | None) -> Inputs:
     own = _database_of_output(inputs.folder) if inputs.folder and inputs.database is None else None
     if own is None:
         return inputs
-    statement = f"inlier matches of {from_here(str(own))} (which the model's locate.json names)"
+    statement = f"inlier matches of {own} (which the model's locate.json names)"
     return replace(inputs, database=own, statement=statement, is_found=True)
 
 

@@ -16,7 +16,7 @@ from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.cli import app
-from sfm_shapefit.commands.lengths import length_of
+from sfm_shapefit.commands.write import WRITERS
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.scale_bars import read_scale_bars
 from sfm_shapefit.scene.given import ScaleBars
@@ -256,7 +256,7 @@ def test_lengths_that_are_none_are_told(ring):
     unknown = "nothing is known of the error of the distance of 0001.jpg and 0002.jpg"
     assert found.warnings[-1].startswith(unknown)
     with pytest.raises(sfm_shapefit.UnsolvableError, match=unknown):
-        length_of(few, "0001.jpg", "0002.jpg")
+        WRITERS.length(few, "0001.jpg", "0002.jpg")
 
 
 def test_a_result_tells_a_length_as_evaluate_does_whether_it_was_adjusted_or_not(
