@@ -84,7 +84,7 @@ def match_images(
 def begin_database(
     folder: Path, path: Path, options: MatchingOptions, clock: Clock
 ) -> tuple[PhotographDatabase, list[str]]:
-    """Make a database with images and lenses; return it and notes for the user. Errors as of `match_images`."""
+    """Make a database with images and lenses; return it, and notes; errors as of `match_images`."""
     refuse_lens(options)
     if options.mask_path:
         refuse_no_folder(Path(options.mask_path), MASKS)

@@ -12,16 +12,17 @@ import sfm_shapefit
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.commands.check import check
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.judgement.lens_questions import images_to_ask
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.tied_groups import lost_points
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline import examination as evidence
-from sfm_shapefit.pipeline.examination import Structure, images_to_ask
 from sfm_shapefit.pipeline.inputs import inputs_from, open_source
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 from tests.models import by_name, write_priors
 from tests.scenes import COURTYARD, RING, copied, edit_database
 
@@ -282,7 +283,7 @@ def test_a_known_focal_length_that_changed_by_more_than_one_of_exif_data_is_to_b
     truth = pycolmap.Reconstruction(COURTYARD / "truth")
     name = truth.image(sorted(truth.reg_image_ids())[5]).name
     found = sfm_shapefit.locate(with_own_lenses(truth, {name: 0.6}), COURTYARD / "database.db")
-    (told,) = (one for one in found.verdict.findings if "too far for one that was known" in one.sentence)
+    (told,) = (one for one in found.verdict.findings if "the one that was known" in one.sentence)
     assert told.images == (name,)
-    assert "focal length 432.0 px (given) became 7" in told.sentence
+    assert "a focal length 1.67 times the one that was known" in told.sentence  # 432 px became 720
     assert found.verdict.grade.value == "look"
