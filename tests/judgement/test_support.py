@@ -173,12 +173,13 @@ def test_threads_that_share_very_many_matches_count_the_same():
     is_wrong = np.arange(per_image) < 20_000
     in_camera[2, is_wrong, :2] += 0.5 * np.abs(in_camera[2, is_wrong, 2:])
     rows = np.arange(3 * per_image).reshape(3, per_image)
+    pairs = np.concatenate([rows[[i, j]].T for i, j in ((0, 1), (0, 2), (1, 2), (1, 2))])
     matched = MatchedKeypoints(
         cameras=np.repeat(np.arange(3, dtype=np.int32), per_image),
         keypoints=np.tile(np.arange(per_image, dtype=np.int32), 3),
         pixels=np.zeros((3 * per_image, 2)),
         on_plane=(in_camera[..., :2] / in_camera[..., 2:]).reshape(-1, 2),
-        matches=np.concatenate([rows[[i, j]].T for i, j in ((0, 1), (0, 2), (1, 2), (1, 2))]),
+        matches=np.ascontiguousarray(pairs, dtype=np.uint32),
     )
     found = []
     for threads in (1, 3):
