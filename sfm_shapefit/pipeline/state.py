@@ -198,7 +198,9 @@ class ModelState:
             images.part(rows), lambda k: view.keypoints(chosen[k]), view.num_keypoints[rows]
         )
 
-    def read_links(self, images: Images, advance: Advance, *, rejected: bool = False) -> Links:
+    def read_links(
+        self, images: Images, advance: Advance, threads: int = 1, *, rejected: bool = False
+    ) -> Links:
         """Return what joins the keypoints of posed images, or matches of rejected pairs; rays are forgotten.
 
         From here to the end of a triangulation, or an adjustment, most memory is needed.
@@ -206,11 +208,11 @@ class ModelState:
         view, rows = self.source.view, images.posed_rows
         pictures, posed = self.pictures(images, rows), images.part(rows)
         if isinstance(self.source.matches, TrackMatches):  # the model has its tracks already
-            return collect_tracks(posed, pictures, self.source.matches.points_of(posed))
+            return collect_tracks(posed, pictures, self.source.matches.points_of(posed), threads)
         wanted = is_among(view.pairs, self.placement.rejected_pairs) == rejected
         if self.among is not None:
             wanted &= np.isin(view.pairs, self.among).all(axis=1)
         links = view.links(chosen=wanted, advance=advance, consume=True)
         place = np.full(images.num_images, -1)
         place[rows] = np.arange(len(rows))
-        return collect_matches(posed, pictures, place, links, view.num_matches)
+        return collect_matches(posed, pictures, place, links, view.num_matches, threads)

@@ -12,12 +12,10 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.lists import offsets_of
-from sfm_shapefit.scene.matches import batch_ranges
+from sfm_shapefit.scene.matches import batch_ranges, lens_runs
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.structure_options import StructureOptions
-
-_AT_ONCE = 50_000  # observations, seen through one lens, that are projected together; their arrays take 4 MB
 
 
 def filter_points(structure: Structure, options: StructureOptions, threads: int = 1) -> Points:
@@ -28,7 +26,7 @@ def filter_points(structure: Structure, options: StructureOptions, threads: int 
     kept = points.taken(fitting)
     sums = np.bincount(kept.points_seen(), errors_px[fitting], kept.num_points)
     kept = replace(kept, errors_px=sums / kept.lengths())
-    is_kept = _are_wide(kept, structure.images.centers, options.min_triangulation_angle_deg)
+    is_kept = _are_wide(kept, structure.images.centers, options.min_triangulation_angle_deg, threads)
     is_kept &= kept.lengths() >= options.min_track_length
     return kept.taken(is_kept[kept.points_seen()])
 
@@ -61,32 +59,36 @@ def keypoint_offsets_px(
 
     def project(some: IntArray) -> tuple[IntArray, FloatArray]:
         observed, lens = rows_of.subset(some), images.lenses[images.lens_of[some[0]]]
-        in_camera = points.xyz[seen[observed.rows]]
+        in_camera = points.xyz.take(seen.take(observed.rows), axis=0)
         for image, own in zip(some.tolist(), observed.slices(), strict=True):
             with np.errstate(invalid="ignore"):  # a point that is not finite
                 in_camera[own] = (in_camera[own] - centers[image]) @ rotations[image].T
         found = structure.pictures.project(int(some[0]), in_camera, ahead=ahead)
-        return observed.rows, lens.offsets_px(found, pixels[observed.rows])
+        return observed.rows, lens.offsets_px(found, pixels.take(observed.rows, axis=0))
 
-    part = np.cumsum(rows_of.lengths()[chosen]) // _AT_ONCE
-    cuts = np.flatnonzero((np.diff(part) != 0) | (np.diff(images.lens_of[chosen]) != 0)) + 1
-    return in_threads(threads, project, np.split(chosen, cuts) if len(chosen) else ())
+    runs = lens_runs(images.lens_of[chosen], rows_of.lengths()[chosen])
+    return in_threads(threads, project, (chosen[begin:end] for begin, end in runs))
 
 
-def _are_wide(points: Points, centers: FloatArray, least_deg: float) -> BoolArray:
+def _are_wide(points: Points, centers: FloatArray, least_deg: float, threads: int) -> BoolArray:
     """Return which points two of their observations see under an angle, or its supplement, of so much."""
     wide, cosine = np.zeros(points.num_points, dtype=np.bool_), np.cos(np.radians(least_deg))
-    for begin, end in batch_ranges(points.lengths(), 100_000):  # so that few rays are held
+
+    def look(ends: tuple[int, int]) -> None:
+        begin, end = ends
         offsets = points.offsets[begin : end + 1]
         lengths, images = np.diff(offsets), points.images[offsets[0] : offsets[-1]]
-        rays = centers[images] - np.repeat(points.xyz[begin:end], lengths, axis=0)
+        rays = centers.take(images, axis=0) - np.repeat(points.xyz[begin:end], lengths, axis=0)
         with np.errstate(invalid="ignore"):
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         for first in range(int(lengths.max(initial=1)) - 1):
             left = np.flatnonzero(~wide[begin:end] & (lengths > first + 1))  # a few, after the first round
             own, counts = offsets[left] - offsets[0] + first, lengths[left] - first - 1
             others = np.repeat(own + 1 - offsets_of(counts)[:-1], counts)
-            ahead = rays[others + np.arange(len(others))]
+            ahead = rays.take(others + np.arange(len(others)), axis=0)
             cosines = np.abs(np.einsum("pa,pa->p", np.repeat(rays[own], counts, axis=0), ahead))
             wide[begin + np.repeat(left, counts)[cosines <= cosine]] = True
+
+    for _ in in_threads(threads, look, batch_ranges(points.lengths(), 100_000)):  # so that few rays are held
+        pass
     return wide

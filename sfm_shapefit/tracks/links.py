@@ -14,15 +14,15 @@ from sfm_shapefit.base.arrays import (
     IntArray,
     stable_order,
 )
-from sfm_shapefit.base.executors import gathered, in_ranges
+from sfm_shapefit.base.executors import gathered, in_ranges, in_threads, overlapped
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
 from sfm_shapefit.scene.epipolar import sampson_px, write_ray
 from sfm_shapefit.tracks.joining import number_trees
 
-# Between two slices Python can be interrupted: about 200 ms. For each all keypoints are counted.
-_MATCHES_A_SLICE = 4_000_000
+_MATCHES_A_SLICE = 4_000_000  # matches that are counted at once; for each slice all keypoints are counted
+_MATCHES_AT_ONCE = 500_000  # matches that are looked at together; Python can be interrupted in between
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,8 +81,8 @@ class ObservedTracks(Lists):
             offsets=joined.offsets,
             cameras=self.cameras[rows],
             keypoints=self.keypoints[rows],
-            pixels=self.pixels[rows],
-            on_plane=self.on_plane[rows],
+            pixels=self.pixels.take(rows, axis=0),
+            on_plane=self.on_plane.take(rows, axis=0),
             ids=ids,
         )
 
@@ -110,18 +110,25 @@ class MatchedKeypoints:
             counts += np.bincount(ends.ravel(), minlength=len(counts)).astype(np.int32)
         return counts
 
-    def among(self, chosen: BoolArray) -> "MatchedKeypoints":
-        """Return the chosen ones of the keypoints (K,), and the matches between them."""
+    def among(self, chosen: BoolArray, threads: int = 1) -> "MatchedKeypoints":
+        """Return the chosen ones of the keypoints (K,), and the matches between them; threads share these."""
         if chosen.all():
             return self
         row_of = np.cumsum(chosen, dtype=self.matches.dtype)
         row_of -= 1
+
+        def renumbered(first: int) -> npt.NDArray[np.integer]:
+            own = self.matches[first : first + _MATCHES_AT_ONCE]
+            i, j = own.T
+            return row_of.take(own.compress(chosen.take(i) & chosen.take(j), axis=0))
+
+        matches = list(in_threads(threads, renumbered, range(0, len(self.matches), _MATCHES_AT_ONCE)))
         return MatchedKeypoints(
             cameras=self.cameras[chosen],
             keypoints=self.keypoints[chosen],
-            pixels=self.pixels[chosen],
-            on_plane=self.on_plane[chosen],
-            matches=row_of[self.matches[chosen[self.matches].all(axis=1)]],
+            pixels=self.pixels.compress(chosen, axis=0),
+            on_plane=self.on_plane.compress(chosen, axis=0),
+            matches=np.concatenate(matches) if matches else self.matches,
         )
 
     def join(self, poses: CameraPoses, limit_px: float, threads: int = 1) -> RowLists:
@@ -132,12 +139,20 @@ class MatchedKeypoints:
         Args:
             poses: of the cameras.
             limit_px: largest Sampson error of a match that joins.
-            threads: number of threads to share the matches among; they are joined by one.
+            threads: number of threads to share the matches among; they are joined by one, beside the others.
         """
         parents = np.arange(len(self.cameras), dtype=np.int32)
         given = self.on_plane, self.cameras, poses.rotations, poses.centers, poses.focal_lengths_px, limit_px
-        for first in range(0, len(self.matches), _MATCHES_A_SLICE):
-            _join(self.matches[first : first + _MATCHES_A_SLICE], given, parents, threads)
+
+        def find_agreeing(first: int) -> tuple[npt.NDArray[np.integer], BoolArray]:
+            matches = self.matches[first : first + _MATCHES_AT_ONCE]
+            agree = np.empty(len(matches), dtype=np.bool_)
+            in_ranges(threads, len(matches), _find_agreeing, matches, agree, *given)
+            return matches, agree
+
+        starts = range(0, len(self.matches), _MATCHES_AT_ONCE)
+        for matches, agree in overlapped(threads, find_agreeing, starts):
+            _merge(matches, agree, parents)
         track = number_trees(parents, np.arange(len(parents), dtype=np.int32))
         del parents  # before what orders the keypoints, which is larger
         rows, lengths = stable_order(track), np.bincount(track)
@@ -155,12 +170,6 @@ class MatchedKeypoints:
             on_plane=gathered(threads, self.on_plane, joined.rows),
             ids=np.arange(len(joined.offsets) - 1),
         )
-
-
-def _join(matches: npt.NDArray[np.integer], given: Any, parents: Int32Array, threads: int) -> None:
-    agree = np.empty(len(matches), dtype=np.bool_)
-    in_ranges(threads, len(matches), _find_agreeing, matches, agree, *given)
-    _merge(matches, agree, parents)
 
 
 @kernel

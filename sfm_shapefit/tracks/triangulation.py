@@ -157,7 +157,7 @@ def triangulate_matches(
     parts = [_triangulate_joined(matched, joined.subset(np.flatnonzero(~is_chain)), *place)]
     left, rows = matched, np.arange(len(is_left))
     for limit_px in joining_limits_px(threshold_px, limits.max_error_px) if is_chain.any() else ():
-        left, rows = left.among(is_left), rows[is_left]
+        left, rows = left.among(is_left, threads), rows[is_left]
         points, seen = _triangulate_joined(left, left.join(poses, limit_px, threads), *place)
         parts.append((points, RowLists(seen.offsets, rows[seen.rows])))
         is_left = np.ones(len(rows), dtype=np.bool_)
