@@ -183,7 +183,8 @@ class Workers:
             work()
         finally:
             for helper in helpers:
-                helper.result()
+                if not helper.cancel():  # one that has not begun has nothing left to do
+                    helper.result()
 
     def share(self, starts: IntArray, work: Callable[[int, int], object], least: int = 1) -> None:
         """Call `work(begin, end)` for ranges of rows, whose answers must not depend on how they are cut.

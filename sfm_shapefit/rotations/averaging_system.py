@@ -122,7 +122,7 @@ class AveragingSystem:
 
     def is_definite(self, diagonal: FloatArray, blocks: FloatArray) -> bool:
         """Return whether blocks (n, 3, 3), and (k, 3, 3) at (i, j) of pairs, make a definite matrix."""
-        return self._factor_of(3).refactor_blocks(self.pairs, diagonal, blocks)
+        return self._factor_of(3).refactor_blocks(diagonal, blocks)
 
     def _factor_of(self, block: int) -> Factor:
         assert self.plan is not None
