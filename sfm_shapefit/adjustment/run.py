@@ -47,14 +47,14 @@ from sfm_shapefit.adjustment.solve import (
 )
 from sfm_shapefit.adjustment.sources import Links, with_rays_of
 from sfm_shapefit.adjustment.views import views_of
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.executors import HERE, Crew
 from sfm_shapefit.base.threads import count_threads
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import FOCAL
 from sfm_shapefit.scene.points import Points
-from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
+from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks, SeenTracks
 from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.thin_tracks import choose_thin_tracks
 from sfm_shapefit.tracks.triangulation import (
@@ -127,9 +127,7 @@ class AdjustmentRun:
         of_lens = zip(self.images.lenses, self.freedom.lenses, strict=True)
         return any(is_free and lens.parameters != lens.given for lens, is_free in of_lens)
 
-    def triangulate(
-        self, widening: float, *, checked: bool = False
-    ) -> tuple[ObservedTracks, TriangulatedPoints]:
+    def triangulate(self, widening: float, *, checked: bool = False) -> tuple[SeenTracks, TriangulatedPoints]:
         """Return the tracks and points at the poses of the images.
 
         Args:
@@ -144,41 +142,46 @@ class AdjustmentRun:
         poses, threads = views_of(self.images).poses(self.images), count_threads(self.crew.threads)
         assert self.links is not None
         if isinstance(self.links, ObservedTracks):
-            joined, found = self.links, triangulate_tracks(self.links, poses, limits, threads)
-        else:
-            error_px = self.options.max_reprojection_error_px
-            joined, found = triangulate_matches(self.links, poses, limits, error_px, threads)
-        frames = self.images.frame_of[views_of(self.images).images[joined.cameras]]
-        return joined, without_lone_frames(found, frames, limits.min_length)
+            found = triangulate_tracks(self.links, poses, limits, threads)
+            return self.links, self._without_lone_frames(self.links, found, limits.min_length)
+        error_px = self.options.max_reprojection_error_px
+        joined, found = triangulate_matches(self.links, poses, limits, error_px, threads)
+        return joined, self._without_lone_frames(joined, found, limits.min_length)
 
-    def problem(self, tracks: ObservedTracks, found: TriangulatedPoints) -> AdjustmentProblem:
+    def _without_lone_frames(
+        self, joined: SeenTracks, found: TriangulatedPoints, least: int
+    ) -> TriangulatedPoints:
+        frames = self.images.frame_of[views_of(self.images).images].astype(np.int32)
+        return without_lone_frames(found, frames[joined.cameras[:]], least)
+
+    def problem(self, tracks: SeenTracks, found: TriangulatedPoints) -> AdjustmentProblem:
         """Return the problem of points that were triangulated from tracks, at the poses of the images."""
         sensors = self.freedom.sensors(self.images)
         return views_of(self.images).problem(self.images, sensors, self.given, tracks, found)
 
     def problem_of_all(
         self, *, checked: bool = False
-    ) -> tuple[ObservedTracks, TriangulatedPoints, AdjustmentProblem]:
+    ) -> tuple[SeenTracks, TriangulatedPoints, AdjustmentProblem]:
         """Return tracks and points at the pixel threshold, as `triangulate` does, and the problem of all."""
         joined, found = self.triangulate(1.0, checked=checked)
         refuse_without_points(len(found.points))
         return joined, found, self.problem(joined, found)
 
-    def share_of_frames(self, tracks: ObservedTracks, found: TriangulatedPoints) -> FloatArray:
+    def share_of_frames(self, tracks: SeenTracks, found: TriangulatedPoints) -> FloatArray:
         """Return the share of each frame's observations of triangulated tracks that fit the points, (n,)."""
-        frames = self.images.frame_of[views_of(self.images).images[tracks.cameras]]
+        frames = self.images.frame_of[views_of(self.images).images[tracks.cameras[:]]]
         track_of = tracks.list_of_rows()
         in_points, count = np.isin(track_of, found.tracks), len(self.images.frames.ids)
         fit, every = (np.bincount(frames[x], minlength=count) for x in (found.points_seen >= 0, in_points))
         return np.where(every > 0, fit / np.maximum(every, 1), 1.0)
 
     def thin_problem(
-        self, tracks: ObservedTracks, found: TriangulatedPoints, *, times: int = 1
+        self, tracks: SeenTracks, found: TriangulatedPoints, *, times: int = 1
     ) -> AdjustmentProblem:
         """Return the problem of few of the points found, or of some times as many."""
         refuse_without_points(len(found.points))
         thin = tracks.of_points(found.points_seen)
-        images = views_of(self.images).images[thin.cameras]
+        images = views_of(self.images).images.astype(np.int32)[thin.cameras[:]]
         chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, self.images.num_images, times)
         del images
         place = np.full(len(found.points), -1, dtype=np.int32)
@@ -341,7 +344,7 @@ class AdjustmentRun:
 Solved = tuple[AdjustmentRun, AdjustmentProblem]
 
 
-def without_lone_frames(found: TriangulatedPoints, frames: IntArray, least: int) -> TriangulatedPoints:
+def without_lone_frames(found: TriangulatedPoints, frames: IndexArray, least: int) -> TriangulatedPoints:
     """Return points of at least so many observations (m,), of which no frame (m,) has a single one.
 
     Where it may move, such a frame and its point run into another camera of that point: nothing is missed
@@ -349,7 +352,7 @@ def without_lone_frames(found: TriangulatedPoints, frames: IntArray, least: int)
     """
     while True:
         seen = found.points_seen >= 0
-        alone = seen & (np.bincount(frames[seen], minlength=int(frames.max(initial=0)) + 1)[frames] == 1)
+        alone = seen & (np.bincount(frames[seen], minlength=int(frames.max(initial=0)) + 1) == 1)[frames]
         if not alone.any():
             return found
         found = replace(found, points_seen=np.where(alone, -1, found.points_seen)).of_length(least)
@@ -446,7 +449,7 @@ def problem_of_poses(run: AdjustmentRun) -> tuple[AdjustmentProblem | None, Adju
 
 def _coarse_points(
     run: AdjustmentRun, fine: TriangulatedPoints
-) -> tuple[ObservedTracks, TriangulatedPoints] | None:
+) -> tuple[SeenTracks, TriangulatedPoints] | None:
     """Return the tracks and points at the wide limit; None if poses are fine, by those at the threshold.
 
     They are not looked for where nine tenths of all matched keypoints see those at the threshold.

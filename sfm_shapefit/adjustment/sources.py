@@ -1,7 +1,7 @@
 """Where points come from: the matches of images, or the points of a model with the same keypoints."""
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from sfm_shapefit.base.arrays import (
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.lists import offsets_of
+from sfm_shapefit.base.row_file import Rows
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
@@ -36,6 +37,7 @@ def collect_matches(
     place: IntArray,
     batches: Iterable[KeypointMatches],
     num_matches: int,
+    make_rows: Callable[..., Rows] = np.empty,
 ) -> MatchedKeypoints:
     """Return all matches between posed images; batches are consumed one at a time.
 
@@ -45,6 +47,7 @@ def collect_matches(
         place: (n,) row in `images` of each image that the batches' pairs index; -1 for those to be left out.
         batches: matches.
         num_matches: that the batches have at most.
+        make_rows: makes room for matches, of a shape and a type; `RowFile` where there are very many.
 
     Raises:
         InputError: if a match refers to a keypoint that its image does not have.
@@ -53,7 +56,7 @@ def collect_matches(
     begins = offsets_of(counts)
     number = np.uint32 if begins[-1] < 2**32 else np.int64
     # Memory is taken as rows are written; one array of each batch, to be joined, would take it twice.
-    room, end = np.empty((num_matches, 2), dtype=number), 0
+    room, end = make_rows((num_matches, 2), dtype=number), 0
     is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
     for batch in batches:
         kept = (place[batch.pairs] >= 0).all(axis=1)
@@ -68,21 +71,25 @@ def collect_matches(
             raise InputError(
                 f"the pair {names} has matches of keypoints that do not exist; match the images again"
             )
-        numbers = room[end : end + len(own)]
-        numbers[:] = own + np.repeat(begins[ends], lengths, axis=0)
-        is_matched[numbers] = True
+        numbers = own + np.repeat(begins[ends], lengths, axis=0)
+        room[end : end + len(own)], is_matched[numbers] = numbers, True
         end += len(own)
     row_of = np.cumsum(is_matched, dtype=number)
+    np.subtract(row_of, 1, out=row_of)
     for first in range(0, end, _MATCHES_A_SLICE):
-        numbers = room[first : min(first + _MATCHES_A_SLICE, end)]
-        numbers[:] = row_of[numbers] - 1
+        own_slice = slice(first, min(first + _MATCHES_A_SLICE, end))
+        room[own_slice] = row_of[room[own_slice]]
     del row_of
     parts = [np.flatnonzero(part).astype(np.int32) for part in np.split(is_matched, begins[1:-1])]
     taken = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
     keypoints = np.concatenate(parts)
     cameras, pixels, on_plane = _look_up(images, pictures, taken, keypoints)
     return MatchedKeypoints(
-        cameras=cameras, keypoints=keypoints, pixels=pixels, on_plane=on_plane, matches=room[:end]
+        cameras=cameras,
+        keypoints=keypoints,
+        pixels=pixels,
+        on_plane=on_plane,
+        matches=room[:end] if isinstance(room, np.ndarray) else room,
     )
 
 
@@ -108,7 +115,7 @@ def links_touching(images: Images, links: Links, chosen: BoolArray) -> Links:
     if isinstance(links, ObservedTracks):
         track_of = links.list_of_rows()
         return links.subset(distinct(track_of[own]))
-    joined = connected_components(len(own), links.matches.astype(np.int64))
+    joined = connected_components(len(own), links.matches[:].astype(np.int64))
     touched = np.zeros(len(own), dtype=np.bool_)
     touched[joined[own]] = True
     return links.among(touched[joined])

@@ -21,7 +21,7 @@ from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points
-from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
+from sfm_shapefit.tracks.links import CameraPoses, SeenTracks
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 
 
@@ -51,7 +51,7 @@ class Views:
         images: Images,
         sensors: BoolArray,
         given: GivenPoses,
-        tracks: ObservedTracks,
+        tracks: SeenTracks,
         found: TriangulatedPoints,
     ) -> AdjustmentProblem:
         """Return the problem of points found of tracks, at the poses of the images of the views.
@@ -98,7 +98,7 @@ class Views:
         translations[own] = np.einsum("cab,cb->ca", back, solved.rig.translations[cameras])
         return moved.with_sensors(rotations, translations)
 
-    def seen_points(self, tracks: ObservedTracks, found: TriangulatedPoints) -> Points:
+    def seen_points(self, tracks: SeenTracks, found: TriangulatedPoints) -> Points:
         """Return triangulated points and their observations; own tracks keep their ids."""
         used = np.flatnonzero(found.points_seen >= 0)
         used = used[np.argsort(found.points_seen[used], kind="stable")]

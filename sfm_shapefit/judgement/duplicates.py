@@ -54,11 +54,11 @@ def find_split_duplicates(
 
 def _depths(images: Images, points: Points) -> FloatArray:
     """Return the median distance of the points of each image, (i,); NaN without any."""
-    distances = np.linalg.norm(points.xyz[points.points_seen()] - images.centers[points.images], axis=1)
-    depths = np.full(images.num_images, np.nan)
+    depths, seen, centers = np.full(images.num_images, np.nan), points.points_seen(), images.centers
     for image, rows in enumerate(points.rows_of_images(images.num_images)):
         if len(rows):
-            depths[image] = np.median(distances[rows])
+            offsets = points.xyz[seen[rows]] - centers[image]
+            depths[image] = np.median(np.linalg.norm(offsets, axis=1))
     return depths
 
 

@@ -15,8 +15,6 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints
 
-_MATCHES_A_SLICE = 4_000_000  # matches between which Python can be interrupted: about 0.2 s
-
 
 def images_of_few_points(points: Points, images: Images, least: IntArray, fixed: BoolArray) -> IntArray:
     """Return how many points images see that are to leave, -1 for those that stay, (i,).
@@ -108,7 +106,8 @@ class PartnerCounts:
         self._free = np.ones_like(self._posed) if fixed is None else ~fixed
         self._sizes = np.where(self._posed, num_keypoints, 0)
         self._begins = offsets_of(self._sizes)
-        self._counts = np.zeros((self._begins[-1], 2), dtype=np.int32)
+        # A keypoint is counted once with each image.
+        self._counts = np.zeros((self._begins[-1], 2), dtype=np.min_scalar_type(max(len(self._sizes), 256)))
 
     def anew(self, images: Images) -> "PartnerCounts":
         """Return counts of nothing yet for images others of which are posed."""
@@ -122,8 +121,8 @@ class PartnerCounts:
             poses.focal_lengths_px, poses.images, self._posed, self._free, self._max_error_px, self._begins,
             last, self._counts,
         )  # fmt: skip
-        for first in range(0, len(matched.matches), _MATCHES_A_SLICE):
-            _count_misses(matched.matches[first : first + _MATCHES_A_SLICE], *given)
+        for matches in matched.slices():
+            _count_misses(matches, *given)
 
     def compare(self, points: Points) -> ObservationCounts:
         """Return how many observations of each image agree with the cameras, and how many contradict them.
@@ -134,7 +133,7 @@ class PartnerCounts:
         partners, misses = self._counts.T
         checked, sees = partners >= CHECKED_BY, np.zeros(len(partners), dtype=np.bool_)
         sees[self._begins[points.images] + points.keypoints] = True
-        parts = (checked, checked & sees, checked & ~sees & (2 * misses > partners))
+        parts = (checked, checked & sees, checked & ~sees & (misses > partners - misses))
         image_of = np.repeat(np.arange(len(self._sizes)), self._sizes)
         columns = (np.bincount(image_of[part], minlength=len(self._sizes)).astype(np.int64) for part in parts)
         return ObservationCounts(**dict(zip(("checked", "agreeing", "contradicting"), columns, strict=True)))

@@ -1,0 +1,74 @@
+"""Rows of numbers in a temporary file: what is read from end to end, and would take the most memory."""
+
+import tempfile
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm_shapefit.base.arrays import AnyArray
+from sfm_shapefit.base.errors import InputError
+
+
+class RowFile:
+    """Rows (m, ...) of one type of number that are written in their order, read by slices, and written over.
+
+    The file has no name, and goes with the object.
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
+        """Begin without a row; `shape` is that of an array with room for all, as of `numpy.empty`."""
+        self.dtype, self._shape, self._length = np.dtype(dtype), shape[1:], 0
+        self._file = tempfile.TemporaryFile(prefix="shapefit-")  # noqa: SIM115  closed with the object
+        self._row_bytes = self.dtype.itemsize * int(np.prod(self._shape))
+
+    def __len__(self) -> int:
+        """Return the number of rows that were written."""
+        return self._length
+
+    def __getitem__(self, rows: slice) -> npt.NDArray[Any]:
+        """Return the rows of a slice of step 1."""
+        first, end, _ = rows.indices(self._length)
+        found = np.empty((max(end - first, 0), *self._shape), self.dtype)
+        self._file.seek(first * self._row_bytes)
+        self._file.readinto(found.data)
+        return found
+
+    def __setitem__(self, rows: slice, values: AnyArray) -> None:
+        """Write rows from the beginning of a slice on, which has as many.
+
+        Raises:
+            InputError: if the folder of temporary files is full.
+        """
+        try:
+            self._file.seek(rows.start * self._row_bytes)
+            self._file.write(np.ascontiguousarray(values, dtype=self.dtype).data)
+            self._file.flush()
+        except OSError as error:
+            raise InputError(
+                f"{tempfile.gettempdir()} has no room for {self._row_bytes * rows.stop / 1e6:.0f} MB of "
+                f"matches ({error.strerror}); set TMPDIR to a folder that has"
+            ) from error
+        self._length = max(self._length, rows.start + len(values))
+
+
+Rows = npt.NDArray[Any] | RowFile
+"""Rows that slices of step 1 read and write."""
+
+
+class Gathered:
+    """Rows of an array, as if they were one array; they are copied where they are looked at."""
+
+    __slots__ = ("_rows", "_source")
+
+    def __init__(self, source: npt.NDArray[Any], rows: npt.NDArray[np.integer[Any]]) -> None:
+        """Take an array and the rows (m,) of it."""
+        self._source, self._rows = source, rows
+
+    def __len__(self) -> int:
+        """Return m."""
+        return len(self._rows)
+
+    def __getitem__(self, chosen: Any) -> Any:
+        """Return those of the m rows that a number, a slice, a mask or numbers choose."""
+        return self._source[self._rows[chosen]]
