@@ -19,7 +19,7 @@ from sfm_shapefit.base.arrays import (
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.lists import offsets_of
-from sfm_shapefit.base.row_file import Rows
+from sfm_shapefit.base.row_file import AnyRows
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
@@ -37,7 +37,7 @@ def collect_matches(
     place: IntArray,
     batches: Iterable[KeypointMatches],
     num_matches: int,
-    make_rows: Callable[..., Rows] = np.empty,
+    make_rows: Callable[..., AnyRows] = np.empty,
 ) -> MatchedKeypoints:
     """Return all matches between posed images; batches are consumed one at a time.
 

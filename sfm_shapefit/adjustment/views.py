@@ -107,7 +107,7 @@ class Views:
             xyz=found.points,
             offsets=offsets_of(lengths),
             images=self.images[tracks.cameras[used]],
-            keypoints=tracks.keypoints[used].astype(np.int64),
+            keypoints=tracks.keypoints[used].astype(np.int32, copy=False),
             ids=1 + np.arange(len(lengths)) if tracks.may_split else tracks.ids[found.tracks],
         )
 

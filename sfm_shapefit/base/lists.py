@@ -69,7 +69,7 @@ class RowLists(Lists):
     offsets: IntArray
     """(k + 1,)"""
     rows: IntArray
-    """(m,) of 32 bits where there may be very many."""
+    """(m,) numbers, 32 bits each where there may be very many."""
 
     @classmethod
     def by_label(cls, labels: IndexArray, count: int = 0) -> "RowLists":

@@ -11,7 +11,7 @@ from sfm_shapefit.base.errors import InputError
 
 
 class RowFile:
-    """Rows (m, ...) of one type of number that are written in their order, read by slices, and written over.
+    """AnyRows (m, ...) of one type of number that are written in their order, read by slices, and written over.
 
     The file has no name, and goes with the object.
     """
@@ -52,8 +52,8 @@ class RowFile:
         self._length = max(self._length, rows.start + len(values))
 
 
-Rows = npt.NDArray[Any] | RowFile
-"""Rows that slices of step 1 read and write."""
+AnyRows = npt.NDArray[Any] | RowFile
+"""AnyRows that slices of step 1 read and write."""
 
 
 class Gathered:

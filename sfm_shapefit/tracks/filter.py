@@ -30,12 +30,14 @@ def filter_points(
     """
     errors_px = keypoint_errors_px(points, images, pictures)
     fitting = points.paired(errors_px <= options.max_reprojection_error_px)  # false for NaN
-    kept = points.taken(fitting)
-    sums = np.bincount(kept.points_seen(), errors_px[fitting], kept.num_points)
-    kept = replace(kept, errors_px=sums / kept.lengths())
-    is_kept = _are_wide(kept, images.centers, options.min_triangulation_angle_deg)
-    is_kept &= kept.lengths() >= options.min_track_length
-    return kept.taken(is_kept[kept.points_seen()])
+    errors_px[~fitting] = 0.0
+    sums = np.bincount(points.points_seen(), errors_px, points.num_points)
+    del errors_px
+    lengths = points.count(fitting)
+    is_kept = _are_wide(points, fitting, lengths, images.centers, options.min_triangulation_angle_deg)
+    is_kept &= lengths >= max(options.min_track_length, 1)
+    points = replace(points, errors_px=sums / np.maximum(lengths, 1))
+    return points.taken(fitting & is_kept[points.points_seen()])
 
 
 def keypoint_errors_px(
@@ -73,20 +75,26 @@ def keypoint_offsets_px(
         yield pixels, images.lenses[images.lens_of[image]].offsets_px(found, pixels)
 
 
-def _are_wide(points: Points, centers: FloatArray, least_deg: float) -> BoolArray:
-    """Return which points two of their observations see under an angle, or its supplement, of so much."""
+def _are_wide(
+    points: Points, chosen: BoolArray, counts: IntArray, centers: FloatArray, least_deg: float
+) -> BoolArray:
+    """Return which points two chosen observations (o,) see under an angle, or its supplement, of so much.
+
+    `counts` (x,) says how many of each point are chosen.
+    """
     wide, cosine = np.zeros(points.num_points, dtype=np.bool_), np.cos(np.radians(least_deg))
-    for begin, end in batch_ranges(points.lengths(), 100_000):  # so that few rays are held
-        offsets = points.offsets[begin : end + 1]
-        lengths, images = np.diff(offsets), points.images[offsets[0] : offsets[-1]]
+    for begin, end in batch_ranges(counts, 100_000):  # so that few rays are held
+        own_rows = slice(points.offsets[begin], points.offsets[end])
+        lengths, images = counts[begin:end], points.images[own_rows][chosen[own_rows]]
+        offsets = offsets_of(lengths)
         rays = centers[images] - np.repeat(points.xyz[begin:end], lengths, axis=0)
         with np.errstate(invalid="ignore"):
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         for first in range(int(lengths.max(initial=1)) - 1):
             left = np.flatnonzero(~wide[begin:end] & (lengths > first + 1))  # a few, after the first round
-            own, counts = offsets[left] - offsets[0] + first, lengths[left] - first - 1
-            others = np.repeat(own + 1 - offsets_of(counts)[:-1], counts)
+            own, others_of = offsets[left] + first, lengths[left] - first - 1
+            others = np.repeat(own + 1 - offsets_of(others_of)[:-1], others_of)
             ahead = rays[others + np.arange(len(others))]
-            cosines = np.abs(np.einsum("pa,pa->p", np.repeat(rays[own], counts, axis=0), ahead))
-            wide[begin + np.repeat(left, counts)[cosines <= cosine]] = True
+            cosines = np.abs(np.einsum("pa,pa->p", np.repeat(rays[own], others_of, axis=0), ahead))
+            wide[begin + np.repeat(left, others_of)[cosines <= cosine]] = True
     return wide

@@ -18,7 +18,7 @@ from sfm_shapefit.base.executors import gathered, in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.lists import Lists, RowLists
-from sfm_shapefit.base.row_file import Gathered, Rows
+from sfm_shapefit.base.row_file import Gathered, AnyRows
 from sfm_shapefit.scene.epipolar import sampson_px, write_ray
 from sfm_shapefit.tracks.joining import list_trees
 
@@ -100,7 +100,7 @@ class MatchedKeypoints:
     """(K, 2) as the adjustment's lens takes them; of 32 bits where these hold them."""
     on_plane: FloatArray
     """(K, 2) see `ObservedTracks`."""
-    matches: Rows
+    matches: AnyRows
     """(m, 2) rows of the above, of any type of integer."""
 
     def slices(self) -> Iterator[IndexArray]:
