@@ -18,6 +18,7 @@ from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points
 from sfm_shapefit.files.colmap.reconstructions import reconstruction_of
 from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import Template
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.structure_options import StructureOptions
 from tests.models import arrays
@@ -83,7 +84,7 @@ def filtered(model, options=None):
 def with_points(model, points, options=None):
     """A copy with these points instead of its own, filtered."""
     images = posed_images(model)
-    kept = filter_points(points, images, pictures_of(model, images), options or StructureOptions())
+    kept = filter_points(Structure(points, images, pictures_of(model, images)), options or StructureOptions())
     return put_points(model, images, kept)
 
 

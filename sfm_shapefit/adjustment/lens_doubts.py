@@ -55,12 +55,12 @@ def covariances_of_open_lenses(
         image_of: (o,) image of each observation.
         is_open: (l,) lenses whose focal length stays what was given, though that is in doubt.
     """
-    found = np.zeros((images.num_images, 3, 3))
+    found, views, centers = np.zeros((images.num_images, 3, 3)), images.rotations[:, 2], images.centers
     for k in np.flatnonzero(is_open[images.lens_of]).tolist():
-        view = images.rotations[k, 2]
+        view = views[k]
         seen = problem.points[problem.points_seen[image_of == k]]
         if len(seen):
-            depth = float(np.median((seen - images.centers[k]) @ view))
+            depth = float(np.median((seen - centers[k]) @ view))
             sigma = images.lenses[images.lens_of[k]].sigmas[FOCAL] * depth
             found[k] = sigma**2 * np.outer(view, view)
     return found

@@ -11,7 +11,7 @@ from sfm_shapefit.base.errors import InputError
 
 
 class RowFile:
-    """AnyRows (m, ...) of one type of number that are written in their order, read by slices, and written over.
+    """Rows (m, ...) of one type of number that are written in their order, read by slices, and written over.
 
     The file has no name, and goes with the object.
     """
@@ -53,7 +53,21 @@ class RowFile:
 
 
 AnyRows = npt.NDArray[Any] | RowFile
-"""AnyRows that slices of step 1 read and write."""
+"""Rows that slices of step 1 read and write."""
+
+
+class Widened:
+    """Numbers of 32 bits, or of 64 already, which have 64 where they are looked at."""
+
+    __slots__ = ("_stored",)
+
+    def __init__(self, stored: npt.NDArray[np.floating[Any]]) -> None:
+        """Take an array of them."""
+        self._stored = stored
+
+    def __getitem__(self, chosen: Any) -> npt.NDArray[np.float64]:
+        """Return what a slice, a mask or numbers choose."""
+        return np.asarray(self._stored[chosen], dtype=np.float64)
 
 
 class Gathered:

@@ -25,8 +25,8 @@ class DistanceFacts(Record):
 
 def told_distances(known: "Sequence[KnownDistance]", images: Images) -> tuple[DistanceFacts, ...]:
     """Return the distances that were told, each with what a model has."""
-    posed = np.flatnonzero(images.is_posed).tolist() if known else []
-    centers = {images.names[k]: images.centers[k] for k in posed}
+    posed = np.flatnonzero(images.is_posed) if known else np.zeros(0, dtype=np.int64)
+    centers = dict(zip(images.names_of(posed), images.centers[posed], strict=True))
     return tuple(
         DistanceFacts(
             first=first,

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import field, replace
-from typing import Annotated, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 
@@ -54,6 +54,24 @@ class OddImages(Record):
         """The same in a sentence."""
         has = "has" if len(self.images) == 1 else "have"
         return f"{counted(len(self.images), 'image')} ({first_of(self.images)}) {has} {self.what}"
+
+
+class LensField(NamedTuple):
+    """Mean residuals of a lens in c cells of its picture."""
+
+    label: str
+    aspect: float
+    """Width of the picture over its height."""
+    places: FloatArray
+    """(c, 2) middles of the cells, as shares of width and height."""
+    means_px: FloatArray
+    """(c, 2)"""
+    statement: str
+    """What they say of the lens, in a sentence."""
+    images: IntArray
+    """(k,) rows of the images that it took."""
+    outward_px: float = 0.0
+    """Mean part along the radius in the ring where that is largest; 0 where it is no pattern of note."""
 
 
 class OpenShape(Record):
@@ -109,6 +127,8 @@ class ModelEvidence(Record):
     """Cameras of the largest group that agreeing pairs, or points that fit, hold; None without pairs."""
     sides: tuple[int, int] = (0, 0)
     """Pairs that agree, and that contradict."""
+    fields: tuple[LensField, ...] = ()
+    """Mean residuals of the lenses with most images, which the report draws."""
 
     def beside(self, second: SecondOpinion, contradicting: Sequence[tuple[str, str]]) -> "ModelEvidence":
         """Return the same with a second opinion, without what that clears, by the pairs that contradict.

@@ -14,8 +14,8 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct_pairs
 from sfm_shapefit.base.wording import in_pixels
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_each
-from sfm_shapefit.scene.images import Images, KeypointRays
-from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 
 _FEWEST_POINTS = 30  # points; an image that sees fewer is weak
@@ -41,17 +41,18 @@ class ImageQuality:
     """(x,) number of images that observe each point."""
 
 
-def image_quality(points: Points, images: Images, pictures: KeypointRays) -> ImageQuality:
+def image_quality(structure: Structure) -> ImageQuality:
     """Return how well each of posed images is held by the points that they observe."""
-    misses_px = keypoint_errors_px(points, images, pictures, ahead=False)
+    points, images = structure.points, structure.images
+    misses_px = keypoint_errors_px(structure, ahead=False)
     n, lengths, seen = images.num_images, points.lengths(), points.points_seen()
     counts, errors = points.count_seen(n), np.full(n, np.nan)
     tracks, coverage = np.full(n, np.nan), np.zeros(n)
-    for k, rows in enumerate(points.rows_of_images(n)):
+    for k, rows in enumerate(structure.rows_of_images):
         if len(rows):
             lens = images.lenses[images.lens_of[k]]
             errors[k], tracks[k] = misses_px[rows].mean(), np.median(lengths[seen[rows]])
-            places = pictures.pixels(k, points.keypoints[rows]) / np.maximum([lens.width, lens.height], 1)
+            places = structure.pixels[rows] / np.maximum([lens.width, lens.height], 1)
             cells = np.clip(_CELLS * places, 0, _CELLS - 1).astype(np.int64)
             coverage[k] = len(distinct_pairs(cells)) / _CELLS**2
     return ImageQuality(

@@ -22,16 +22,16 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
-from sfm_shapefit.base.executors import in_ranges
+from sfm_shapefit.base.executors import in_ranges, in_threads
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.base.losses import CAUCHY, weighed
 from sfm_shapefit.judgement.limits import FEWEST_POINTS, FITTING_PX
 from sfm_shapefit.pairs.kernels import fill_basis, median
-from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.lens import LARGEST_SIGMA
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 
 _UNKNOWNS = 7  # rotation, shift, log of the focal length; in this order
 _MOST_STEPS = 25  # Gauss-Newton steps; ten are usual, a focal length 1.5 times too large takes 15
@@ -43,6 +43,7 @@ _WIDTH = 2.0  # standard deviations of Cauchy's loss; see Holland and Welsch (19
 _LEAST_DETERMINANT = 1e-12  # determinant of A over its trace cubed; below, the others do not hold a point
 _LEAST_PIVOT = 1e-13  # pivot of a unit diagonal; rounding leaves as much where nothing determines an unknown
 _LEAST_NOISE = 1e-4  # pixels squared; exact points have none, but bend to what is wrong elsewhere
+_AT_ONCE = 50_000  # observations through one lens whose rays are made together; their arrays take 6 MB
 _LEAST_FREE = 5e-6  # free share; exactly flat scenes have less, wrong lenses in true ones from 1e-5 on
 
 
@@ -73,31 +74,26 @@ class LeftOut:
 
 
 def leave_one_out(
-    points: Points,
-    images: Images,
-    pictures: KeypointRays,
-    threads: int = 1,
-    believed: BoolArray | None = None,
-    asked: BoolArray | None = None,
+    structure: Structure, threads: int = 1, believed: BoolArray | None = None, asked: BoolArray | None = None
 ) -> LeftOut:
     """Return pose and focal length of each image by the points as the others make them.
 
     Each image is fitted on its own: `threads` change no bit of the answer.
 
     Args:
-        points: of the images.
-        images: where they stand; those without a pose observe nothing.
-        pictures: keypoints and lenses of the images.
+        structure: images where they stand, and their points; those without a pose observe nothing.
         threads: number of threads to share the images among.
         believed: (i,) images whose rays make the points of others; all if None.
         asked: (i,) images that are left out; all if None. Nothing is known of the others.
     """
-    n = images.num_images
+    images, points, n = structure.images, structure.points, structure.images.num_images
     believed = np.ones(n, dtype=np.bool_) if believed is None else believed
+    rows: slice | BoolArray = slice(None)
     if asked is not None:
         seen = np.bincount(points.points_seen(), asked[points.images], points.num_points) > 0.0
-        points = points.taken(seen[points.points_seen()])
-    points, rays, on_plane = _look(points, images, pictures)
+        rows = seen[points.points_seen()]
+        points = points.taken(rows)
+    points, rays, on_plane = _look(replace(structure, points=points), structure.pixels[rows], threads)
     of_images = RowLists.by_label(points.images, n)
     given = (
         points.xyz, points.offsets, points.images, points.points_seen(), rays, on_plane, of_images.rows,
@@ -107,28 +103,34 @@ def leave_one_out(
     counts, figures = np.zeros(n, dtype=np.int64), np.full((n, 4), np.nan)
     arrays = *(frozen(np.ascontiguousarray(array)) for array in given), counts, figures
 
-    rows = np.arange(n) if asked is None else np.flatnonzero(asked)
-    in_ranges(threads, len(rows), fit_images, rows, *arrays)
+    left_out = np.arange(n) if asked is None else np.flatnonzero(asked)
+    in_ranges(threads, len(left_out), fit_images, left_out, *arrays)
     return LeftOut(counts, *figures.T)
 
 
-def _look(points: Points, images: Images, pictures: KeypointRays) -> tuple[Points, FloatArray, FloatArray]:
+def _look(structure: Structure, pixels: FloatArray, threads: int) -> tuple[Points, FloatArray, FloatArray]:
     """Return the points with the observations that have a ray, these (o, 3), and their places.
 
-    Rays are of length 1 and in camera axes; a place (o, 2) is that in a picture of focal length 1.
+    Observations are at `pixels` (o, 2). Rays are of length 1 and in camera axes; a place (o, 2) is that in a
+    picture of focal length 1.
     """
-    rays, places = np.zeros((len(points.images), 3)), np.zeros((len(points.images), 2))
-    angular = images.are_angular
-    for k, rows in enumerate(points.rows_of_images(images.num_images)):
-        if not len(rows):
-            continue
-        own = normalized(pictures.rays(k, pictures.pixels(k, points.keypoints[rows])))
+    points, images = structure.points, structure.images
+    rays, places = np.zeros((len(pixels), 3)), np.zeros((len(pixels), 2))
+
+    def look(rows: IntArray) -> None:
+        image = int(points.images[rows[0]])
+        own = normalized(structure.pictures.rays(image, pixels[rows]))
         with np.errstate(divide="ignore", invalid="ignore"):
             stretch = 1.0 / own[:, 2]
-            if angular[k]:
+            if images.lenses[images.lens_of[image]].is_angular:
                 across = np.hypot(own[:, 0], own[:, 1])
                 stretch = np.where(across > 0.0, np.arctan2(across, own[:, 2]) / across, 1.0)
-            rays[rows], places[rows] = own, own[:, :2] * stretch[:, None]
+        rays[rows], places[rows] = own, own[:, :2] * stretch[:, None]
+
+    of_lenses = RowLists.by_label(images.lens_of[points.images], len(images.lenses))
+    parts = (rows[k : k + _AT_ONCE] for rows in of_lenses for k in range(0, len(rows), _AT_ONCE))
+    for _ in in_threads(threads, look, parts):
+        pass
     has_ray = np.asarray(np.isfinite(rays).all(axis=1))
     if has_ray.all():
         return points, rays, places

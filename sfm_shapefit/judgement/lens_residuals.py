@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.judgement.evidence import OddImages
+from sfm_shapefit.judgement.evidence import LensField, OddImages
 from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.structure import Structure
@@ -36,24 +36,6 @@ _CHANCE = 0.005  # probability of as much of a pattern by chance; a page shows a
 _OF_NOTE = 0.05  # share of the squared residuals; what a smaller pattern adds to their RMS is below 3 %
 _BENDS_PX = 0.25  # pixels along the radius; see the header
 _RINGS = 5  # rings about the principal point, of as many residuals each; a profile may change its sign
-
-
-class LensField(NamedTuple):
-    """Mean residuals of a lens in c cells of its picture."""
-
-    label: str
-    aspect: float
-    """Width of the picture over its height."""
-    places: FloatArray
-    """(c, 2) middles of the cells, as shares of width and height."""
-    means_px: FloatArray
-    """(c, 2)"""
-    statement: str
-    """What they say of the lens, in a sentence."""
-    images: IntArray
-    """(k,) rows of the images that it took."""
-    outward_px: float = 0.0
-    """Mean part along the radius in the ring where that is largest; 0 where it is no pattern of note."""
 
 
 class _Residuals(NamedTuple):
@@ -78,13 +60,13 @@ def lens_fields(structure: Structure) -> tuple[LensField, ...]:
 
     Lenses of a few images each, as in a collection from many devices, are taken together by their model.
     """
-    images, rows_of = structure.images, structure.points.rows_of_images(structure.images.num_images)
-    seeing = images.is_posed & np.array([len(rows) > 0 for rows in rows_of], dtype=np.bool_)
+    images, rows_of = structure.images, structure.rows_of_images
+    seeing = images.is_posed & (rows_of.lengths() > 0)
     groups = _by_lens(images, np.flatnonzero(seeing if structure.among is None else seeing & structure.among))
     found = []
     for label, members in sorted(groups.items(), key=lambda group: -len(group[1]))[:_MOST_FIELDS]:
         chosen = members[:: -(-len(members) // _MOST_IMAGES)]
-        residuals = _residuals_of(structure, chosen, [rows_of[k] for k in chosen])
+        residuals = _residuals_of(structure, np.array(chosen))
         if len(residuals.images) >= _FEWEST_RESIDUALS:
             width, height = images.sizes_px[members[0]].tolist()
             field = _average(label, width / height, _without_large(residuals))
@@ -92,17 +74,20 @@ def lens_fields(structure: Structure) -> tuple[LensField, ...]:
     return tuple(found)
 
 
-def find_bent_lenses(structure: Structure) -> Iterator[OddImages]:
-    """Yield the images of lenses whose residuals point along the radius, so that poses may have bent."""
-    for field in lens_fields(structure):
+def find_bent_lenses(fields: Sequence[LensField], names: Sequence[str]) -> Iterator[OddImages]:
+    """Yield the images of lenses whose residuals point along the radius, so that poses may have bent.
+
+    The `names` are those of all images.
+    """
+    for field in fields:
         if abs(field.outward_px) > _BENDS_PX:
             side = "outward" if field.outward_px > 0.0 else "inward"
             sentence = (
                 f"a lens that does not fit: residuals point {side} by {{}} px in a ring of its picture, and "
                 "poses bend to that; --intrinsics all refines distortion, OPENCV and OPENCV_FISHEYE have more"
             )
-            names = structure.images.names_of(field.images)
-            yield OddImages.of_values(Kind.LENS, names, np.full(len(names), abs(field.outward_px)), sentence)
+            bent = tuple(names[k] for k in field.images.tolist())
+            yield OddImages.of_values(Kind.LENS, bent, np.full(len(bent), abs(field.outward_px)), sentence)
 
 
 def _by_lens(images: Images, chosen: IntArray) -> dict[str, list[int]]:
@@ -116,19 +101,23 @@ def _by_lens(images: Images, chosen: IntArray) -> dict[str, list[int]]:
     return groups
 
 
-def _residuals_of(structure: Structure, chosen: Sequence[int], rows_of: Sequence[IntArray]) -> _Residuals:
-    """Return the residuals of chosen images, by the observations of each."""
-    points, images, pictures = structure[:3]
-    parts = [_Residuals(np.zeros(0, np.int64), *np.zeros((3, 0, 2)))]
-    of_images = keypoint_offsets_px(points, images, pictures, zip(chosen, rows_of, strict=True))
-    for k, (image, (pixels, offsets_px)) in enumerate(zip(chosen, of_images, strict=True)):
-        lens = images.lenses[images.lens_of[image]]
-        size = np.array([lens.width, lens.height])
-        arms = pixels - (size / 2.0 if lens.is_panorama else lens.split_parameters()[1])
-        every = _Residuals(np.full(len(pixels), k), pixels / np.maximum(size, 1), arms, -offsets_px)
-        is_usable = np.isfinite(offsets_px).all(axis=1) & bool(size.all())
-        parts.append(every.taken(np.asarray(is_usable)))
-    return _Residuals(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+def _residuals_of(structure: Structure, chosen: IntArray) -> _Residuals:
+    """Return the residuals of chosen images."""
+    lenses, lens_of = structure.images.lenses, structure.images.lens_of[chosen]
+    observed, sizes = structure.rows_of_images.subset(chosen), structure.images.sizes_px[chosen]
+    middles = [
+        np.array([lens.width, lens.height]) / 2.0 if lens.is_panorama else lens.split_parameters()[1]
+        for lens in lenses
+    ]
+    offsets_px = np.concatenate([found for _, found in keypoint_offsets_px(structure, chosen)])
+    pixels = structure.pixels[observed.rows]
+    every = _Residuals(
+        observed.list_of_rows(),
+        pixels / observed.spread(np.maximum(sizes, 1)),
+        pixels - observed.spread(np.array([middles[lens] for lens in lens_of.tolist()])),
+        -offsets_px,
+    )
+    return every.taken(np.isfinite(offsets_px).all(axis=1) & observed.spread(np.asarray(sizes.all(axis=1))))
 
 
 def _without_large(residuals: _Residuals) -> _Residuals:

@@ -30,13 +30,13 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, distinct, quantile
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
+from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import FITTING_PX, LOCAL_SHARE, RIVAL_SHARE, SMALLEST_SHAPE, SURE_SIGMAS
 from sfm_shapefit.judgement.reasons import Kind
-from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.lens import Lens
-from sfm_shapefit.scene.points import Points
 from sfm_shapefit.scene.sequences import find_sequences
+from sfm_shapefit.scene.structure import Structure
 
 _LEAST_OF_SINE, _MOST_OF_TANGENT, _USUAL_OF_TANGENT = 0.95, 1.5, 1.15  # factors of the limits; see the header
 _WIDEST_DEG, _FINEST_PX = 150.0, 412_530.0  # degrees; focal length in pixels where one is 0.5 seconds of arc
@@ -136,18 +136,15 @@ def _middle(lens: Lens) -> FloatArray:
     return principal if ((principal >= 0.0) & (principal <= size)).all() else 0.5 * size
 
 
-def find_odd_lenses(
-    images: Images, points: Points, pictures: KeypointRays, bogus: BoolArray
-) -> Iterator[OddImages]:
+def find_odd_lenses(structure: Structure, bogus: BoolArray) -> Iterator[OddImages]:
     """Yield the posed images whose lenses cannot be, or hardly, together by what is wrong about them.
 
-    Args:
-        images, points, pictures: of one model; images without a pose do not count.
-        bogus: (l,) lenses for which COLMAP's mapper drops images (`Camera.has_bogus_params`).
+    For `bogus` lenses (l,), COLMAP's mapper drops images (`Camera.has_bogus_params`).
     """
+    images = structure.images
     posed = np.flatnonzero(images.is_posed)
     widths, faults = np.full(len(images.lenses), np.nan), dict[tuple[str, bool], list[int]]()
-    reach_px = _reaches(images, points, pictures)
+    reach_px = _reaches(structure)
     for k in distinct(images.lens_of[posed]).tolist():
         lens = images.lenses[k]
         if lens.is_adjustable and min(lens.width, lens.height) > 0:
@@ -195,12 +192,10 @@ def _scatter(logs: FloatArray) -> float:
     return SIGMA_PER_MEDIAN * float(np.median(np.abs(logs - np.median(logs))))
 
 
-def _reaches(images: Images, points: Points, pictures: KeypointRays) -> FloatArray:
+def _reaches(structure: Structure) -> FloatArray:
     """Return how far from the principal point of each lens its points reach, (l,) in pixels, or NaN."""
-    far: list[list[FloatArray]] = [[np.zeros(0)] for _ in images.lenses]
-    for k, rows in enumerate(points.rows_of_images(images.num_images)):
-        lens = images.lenses[images.lens_of[k]]
-        if len(rows) and lens.is_adjustable:
-            away = pictures.pixels(k, points.keypoints[rows]) - _middle(lens)
-            far[images.lens_of[k]].append(np.hypot(*away.T))
-    return np.array([quantile(each, _REACHED) if len(each) else np.nan for each in map(np.concatenate, far)])
+    lenses, lens_of = structure.images.lenses, structure.images.lens_of[structure.points.images]
+    middles = np.array([_middle(lens) if lens.is_adjustable else (np.nan, np.nan) for lens in lenses])
+    far = np.hypot(*(structure.pixels[:, axis] - middles[lens_of, axis] for axis in range(2)))
+    own = RowLists.by_label(lens_of, len(lenses))
+    return np.array([quantile(far[rows], _REACHED) if len(rows) else np.nan for rows in own])

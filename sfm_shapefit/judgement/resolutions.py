@@ -18,8 +18,7 @@ from sfm_shapefit.judgement.conventions import Recognized
 from sfm_shapefit.judgement.evidence import OddImages
 from sfm_shapefit.judgement.limits import FITTING_PX
 from sfm_shapefit.judgement.reasons import Kind
-from sfm_shapefit.scene.images import Images, KeypointRays
-from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 
 _GROSS_PX = 2.0  # median reprojection error in pixels; smaller ones are no matter of the resolution
 _VANISHES = 0.25  # largest share of this error that is left at the right scale; noise is less
@@ -43,14 +42,16 @@ def recognize_sizes(sizes_px: FloatArray, database_px: FloatArray) -> Recognized
     )
 
 
-def recognize_resolution(points: Points, images: Images, pictures: KeypointRays) -> Recognized | None:
+def recognize_resolution(structure: Structure) -> Recognized | None:
     """Return by what factors observations are scaled; None if by none that explains their errors."""
-    seen, rows_of, found = points.points_seen(), points.rows_of_images(images.num_images), []
+    points, images, pictures = structure.points, structure.images, structure.pictures
+    seen, rows_of, found = points.points_seen(), list(structure.rows_of_images), []
+    rotations, centers, sizes_px = images.rotations, images.centers, images.sizes_px
     for k in range(0, images.num_images, -(-images.num_images // _MOST_IMAGES)):
-        rows, size = rows_of[k], images.sizes_px[k]
-        in_camera = (points.xyz[seen[rows]] - images.centers[k]) @ images.rotations[k].T
+        rows = rows_of[k]
+        in_camera = (points.xyz[seen[rows]] - centers[k]) @ rotations[k].T
         both = np.stack([pictures.pixels(k, points.keypoints[rows]), pictures.project(k, in_camera)], axis=1)
-        found.append(np.append(both, np.broadcast_to(size, (len(rows), 1, 2)), axis=1))
+        found.append(np.append(both, np.broadcast_to(sizes_px[k], (len(rows), 1, 2)), axis=1))
     pixels, projected, sizes = np.concatenate(found).transpose(1, 0, 2)
     far = (projected > _FAR * sizes) & (projected < sizes)  # false for NaN
     if not far.any(axis=0).all():
@@ -73,15 +74,17 @@ def recognize_resolution(points: Points, images: Images, pictures: KeypointRays)
     )
 
 
-def find_outside(images: Images, points: Points, pictures: KeypointRays) -> Iterator[OddImages]:
+def find_outside(structure: Structure) -> Iterator[OddImages]:
     """Yield the images of lenses more than 1 % of whose observations are outside the picture."""
-    outside, every = np.zeros((2, len(images.lenses)))
-    for k, rows in enumerate(points.rows_of_images(images.num_images)):
-        if len(rows) and images.is_posed[k] and (images.sizes_px[k] > 0).all():
-            pixels = pictures.pixels(k, points.keypoints[rows])
-            is_out = (pixels < -FITTING_PX) | (pixels > images.sizes_px[k] + FITTING_PX)
-            outside[images.lens_of[k]] += np.count_nonzero(is_out.any(axis=1))
-            every[images.lens_of[k]] += len(rows)
+    images, image_of, sizes_px = structure.images, structure.points.images, structure.images.sizes_px
+    asked, is_out = images.is_posed & (sizes_px > 0).all(axis=1), np.zeros(len(image_of), dtype=np.bool_)
+    for axis in range(2):
+        along = structure.pixels[:, axis]
+        is_out |= (along < -FITTING_PX) | (along > (sizes_px[:, axis] + FITTING_PX)[image_of])
+    numbers = (np.bincount(image_of[part], minlength=len(asked)) for part in (is_out, slice(None)))
+    outside, every = (
+        np.bincount(images.lens_of[asked], number[asked], len(images.lenses)) for number in numbers
+    )
     shares = (outside / np.maximum(every, 1))[images.lens_of]
     if (odd := np.flatnonzero(images.is_posed & (shares > _OUTSIDE))).size:
         sentence = (

@@ -1,5 +1,7 @@
 """Which images are tied to one another, by points, pairs and what is known, and which groups hardly are."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray, distinct
@@ -29,7 +31,12 @@ def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:
 
 
 def tie_images(
-    view: View, fits: PairFits, structure: Structure, fixed: BoolArray | None, tied_pairs: IntArray | None
+    view: View,
+    fits: PairFits,
+    structure: Structure,
+    fixed: BoolArray | None,
+    tied_pairs: IntArray | None,
+    threads: int = 1,
 ) -> tuple[IntArray, tuple[UntiedGroup, ...]]:
     """Return what each image (i,) is tied to, by number, and the groups that hardly anything ties to it.
 
@@ -37,23 +44,23 @@ def tie_images(
     Where too few points are known for that, what pairs and points hold is one, and no group is named but what
     hangs on one pair or image.
     """
-    points, images, pictures = structure[:3]
+    points, images = structure.points, structure.images
     frames = images.frame_of
 
     def images_of(inside: BoolArray) -> tuple[str, ...]:
         return images.names_of(np.flatnonzero(inside[frames] & images.is_posed))
 
-    fitting = keypoint_errors_px(points, images, pictures) <= FITTING_PX
-    rays = Rays(points.points_seen(), frames.astype(np.int32)[points.images], fitting)
+    fitting = keypoint_errors_px(structure, threads=threads) <= FITTING_PX
+    rays = Rays(points.points_seen(), frames.astype(np.int32)[points.images], fitting).of_three()
     pairs = links_of_pairs(*(frames[side] for side in fits.sides))
     known = [] if fixed is None else [frames[rigid_strip(images, fixed)]]
     if tied_pairs is not None:
         tied = frames[tied_pairs]
         known.append(tied[tied[:, 0] != tied[:, 1]])
     together = np.concatenate([np.zeros((0, 2), dtype=np.int64), *known])
-    group = rigid_groups(len(images.frames.ids), rays, together)
+    group = rigid_groups(len(images.frames.ids), rays, together, threads)
     lost = lost_points(view, structure, fitting, group[frames])
-    rays = rays._replace(fits=fitting & ~lost[rays.points])
+    rays = rays._replace(fits=rays.fits & ~lost[rays.points])
     tied, groups = find_groups(group, rays, pairs, images_of)
     posed, of = distinct(frames[images.is_posed]), tied[frames]
     if 2 * np.bincount(tied[posed]).max(initial=0) < len(posed):
@@ -73,7 +80,7 @@ def lost_points(view: View, structure: Structure, fits: BoolArray, group: IntArr
     Some matches of a pair that repeated structure has made may fit where it puts a group; others, of points
     that either side knows, do not: they see two that do not coincide.
     """
-    points, images = structure[:2]
+    points, images = structure.points, structure.images
     across = images.is_posed[view.pairs].all(axis=1) & (group[view.pairs[:, 0]] != group[view.pairs[:, 1]])
     lost, carried = np.zeros((2, points.num_points), dtype=np.bool_)
     if not (across.any() and structure.has_keypoints_of(view)):
@@ -97,7 +104,7 @@ def lost_points(view: View, structure: Structure, fits: BoolArray, group: IntArr
                 keypoints=batch.keypoints[rows, 1 - end],
                 ids=rows,
             )
-            rows = rows[keypoint_errors_px(one, images, structure.pictures) <= FITTING_PX]
+            rows = rows[keypoint_errors_px(replace(structure, points=one)) <= FITTING_PX]
         apart[rows] = False
         num_fit, num_missing = (np.bincount(pair[x], minlength=len(batch.pairs)) for x in (same, apart))
         sound = (num_fit >= OUTNUMBERED * num_missing)[pair]

@@ -21,15 +21,15 @@ piece that pairs and shared points make. What such a pair says nothing checks, b
 `scripts/results/verdict.md` has halves of scenes that few pairs tie.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import (
     BoolArray,
-    FloatArray,
     Int32Array,
     IntArray,
     distinct,
@@ -37,6 +37,7 @@ from sfm_shapefit.base.arrays import (
     rows_taken,
     sum_by,
 )
+from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.wording import are, counted
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
@@ -78,7 +79,7 @@ class _Rule(NamedTuple):
     spare: int
     most_missing: float
 
-    def tie(self, fitting: FloatArray | int, missing: FloatArray | int) -> BoolArray:
+    def tie(self, fitting: IntArray | int, missing: IntArray | int) -> BoolArray:
         """Return where enough fit, and few miss."""
         return np.asarray((fitting >= self.least) & (missing <= self.most_missing * fitting))
 
@@ -128,11 +129,20 @@ class Rays(NamedTuple):
             fits.append(self.fits[there] & self.fits[there + step])
         return NodeLinks(np.concatenate(ids), np.concatenate(ends), np.concatenate(fits))
 
-    def blocks(self) -> Iterator[NodeLinks]:
-        """Yield the links of some points at a time."""
+    def blocks(self) -> list["Rays"]:
+        """Return the rays of some points each, which make half a million links, or those of one point."""
         rays = np.bincount(self.points)
         block = (np.cumsum(rays * (rays - 1) // 2) // _LINKS_A_BLOCK)[self.points]
-        return (rows_taken(self, block == number).links() for number in distinct(block).tolist())
+        ends = [0, *(np.flatnonzero(np.diff(block)) + 1).tolist(), len(block)]
+        rows = (slice(*both) for both in pairwise(ends))
+        return [Rays(self.points[own], self.nodes[own], self.fits[own]) for own in rows]
+
+    def of_three(self) -> "Rays":
+        """Return the rays of points that three nodes see; none of a point fits unless three do."""
+        lengths = np.diff(self.starts(), append=len(self.points))
+        rays, lengths = rows_taken(self, np.repeat(lengths > 2, lengths)), lengths[lengths > 2]
+        fitting = np.add.reduceat(rays.fits, rays.starts(), dtype=np.int64)
+        return rays._replace(fits=rays.fits & np.repeat(fitting > 2, lengths))
 
 
 def links_of_pairs(agreeing: IntArray, contradicting: IntArray) -> NodeLinks:
@@ -146,9 +156,9 @@ def find_groups(
 ) -> tuple[IntArray, tuple[UntiedGroup, ...]]:
     """Return the group of each node, (n,), and those that are not tied to the largest.
 
-    What is unchecked is one group with the largest all the same. `group` (n,) is as of `rigid_groups`.
+    What is unchecked is one group with the largest all the same. `group` (n,) is as of `rigid_groups`, rays
+    are those of three.
     """
-    rays = _of_three(rays)
     groups, starts = group.astype(np.int32)[rays.nodes], rays.starts()
     several = np.minimum.reduceat(groups, starts) != np.maximum.reduceat(groups, starts)
     crossing = np.repeat(several, np.diff(starts, append=len(groups)))
@@ -168,14 +178,15 @@ def find_hanging(
 ) -> tuple[UntiedGroup, ...]:
     """Return the groups of nodes, of one or more of all n, that a single pair or node holds.
 
-    Nodes (k, 2) are `known` to stand rightly to one another; those that no pair holds are not asked.
+    Nodes (k, 2) are `known` to stand rightly to one another; those that no pair holds are not asked. Rays are
+    those of three.
     """
     edges = _distinct_edges(np.concatenate([pairs.ends[pairs.fits], known]))
     if not (outside := _outside(count, edges)).any():
         return ()
-    rays = _of_three(rays)
-    rays = rows_taken(rays, np.isin(rays.points, rays.points[outside[rays.nodes]]))
-    names, *numbers = _count(np.arange(count), rays.blocks())
+    near = np.bincount(rays.points, outside[rays.nodes]) > 0
+    rays = rows_taken(rays, near[rays.points])
+    names, *numbers = _count_shared(count, rays, 1)
     shared = np.column_stack(np.divmod(names[_BY_POINTS.tie(*numbers)], count))
     edges = _distinct_edges(np.concatenate([edges, shared]))
     outside, points = _outside(count, edges), rays.links()
@@ -204,22 +215,15 @@ def _outside(count: int, edges: IntArray) -> BoolArray:
     return np.asarray(asked & ~inside & (2 * inside.sum() >= asked.sum()))
 
 
-def _of_three(rays: Rays) -> Rays:
-    """Return the rays of points that three nodes see; none of a point fits unless three do."""
-    lengths = np.diff(rays.starts(), append=len(rays.points))
-    rays, lengths = rows_taken(rays, np.repeat(lengths > 2, lengths)), lengths[lengths > 2]
-    fitting = np.add.reduceat(rays.fits, rays.starts(), dtype=np.int64)
-    return rays._replace(fits=rays.fits & np.repeat(fitting > 2, lengths))
-
-
-def rigid_groups(count: int, rays: Rays, known: IntArray) -> IntArray:
+def rigid_groups(count: int, rays: Rays, known: IntArray, threads: int = 1) -> IntArray:
     """Return the group of each node (n,) by the points that two of them share, a share of all points.
 
-    Nodes (k, 2) are `known` to stand rightly to one another.
+    Rays are those of three. Nodes (k, 2) are `known` to stand rightly to one another.
     """
-    rays, group = _of_three(rays), np.arange(count)
+    group = np.arange(count)
     step = len(rays.points) // (_MOST_RAYS * count) + 1
-    names, fitting, missing = _count(group, rows_taken(rays, rays.points % step == 0).blocks())
+    some = rows_taken(rays, rays.points % step == 0)
+    names, fitting, missing = _count_shared(count, some, threads)
     names = names[_BY_POINTS.tie(fitting, missing)]
     strong = np.concatenate([np.column_stack(np.divmod(names, count)), known])
     strong = distinct_pairs(np.sort(strong, axis=1))
@@ -270,9 +274,9 @@ def _describe(inside: BoolArray, points: NodeLinks, pairs: NodeLinks, images_of:
     )
 
 
-def _tied(group: IntArray, links: NodeLinks, rule: _Rule) -> tuple[IntArray, FloatArray]:
+def _tied(group: IntArray, links: NodeLinks, rule: _Rule) -> tuple[IntArray, IntArray]:
     """Return the pairs (p, 2) that links tie of the groups of nodes (n,), and how many fit (p,)."""
-    names, fitting, missing = _count(group, [links])
+    names, fitting, missing = _count(group, links)
     enough = rule.tie(fitting, missing)
     both, sizes = np.column_stack(np.divmod(names, len(group))), np.bincount(group, minlength=len(group))
     across = rows_taken(links, links.fits & (group[links.ends[:, 0]] != group[links.ends[:, 1]]))
@@ -290,20 +294,27 @@ def _tied(group: IntArray, links: NodeLinks, rule: _Rule) -> tuple[IntArray, Flo
     return both[enough], fitting[enough]
 
 
-def _count(group: IntArray, blocks: Iterable[NodeLinks]) -> tuple[IntArray, FloatArray, FloatArray]:
+def _count(group: IntArray, links: NodeLinks) -> tuple[IntArray, IntArray, IntArray]:
     """Return the pairs (p,) of groups that links cross, ascending, and how many fit and miss of each, (p,).
 
-    A pair of groups is one number. Links of a point are in one block; it misses where one of them does.
+    A pair of groups is one number. A point misses where one of its links does.
     """
-    tables = [np.zeros((3, 0))]
-    for links in blocks:
-        ends, span = np.sort(group[links.ends], axis=1), int(links.ids.max(initial=0)) + 1
-        pair = np.where(ends[:, 0] != ends[:, 1], ends @ np.array([len(group), 1]), -1)
-        keys = distinct((pair * span + links.ids) * 2 + links.fits)
-        keys = keys[np.append(True, keys[1:] >> 1 != keys[:-1] >> 1)[: len(keys)] & (keys >= 0)]
-        names, row = np.unique(keys // (2 * span), return_inverse=True)
-        tables.append(np.stack([names, np.bincount(row, keys % 2), np.bincount(row, 1 - keys % 2)]))
-    table = np.concatenate(tables, axis=1)
-    names, row = np.unique(table[0].astype(np.int64), return_inverse=True)
-    counts = sum_by(row, table[1:].T, len(names))
+    first, second = group[links.ends[:, 0]], group[links.ends[:, 1]]
+    pair = np.minimum(first, second) * len(group) + np.maximum(first, second)
+    span = int(links.ids.max(initial=0)) + 1
+    keys = distinct(((pair * span + links.ids) * 2 + links.fits)[first != second])
+    keys = keys[np.append(True, keys[1:] >> 1 != keys[:-1] >> 1)[: len(keys)]]
+    pair = keys // (2 * span)
+    ends = np.append(np.flatnonzero(pair[1:] != pair[:-1]) + 1, len(pair))[: len(pair)]
+    fitting = np.diff(np.append(0, np.cumsum(keys & 1)[ends - 1]))
+    return pair[ends - 1], fitting, np.diff(np.append(0, ends)) - fitting
+
+
+def _count_shared(count: int, rays: Rays, threads: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the same of each two of all nodes by the points that they share; threads share the points."""
+    nodes, empty = np.arange(count), (np.zeros(0, dtype=np.int64),) * 3
+    blocks = in_threads(threads, lambda block: _count(nodes, block.links()), rays.blocks())
+    pairs, fitting, missing = map(np.concatenate, zip(empty, *blocks, strict=True))
+    names, row = np.unique(pairs, return_inverse=True)
+    counts = sum_by(row, np.stack([fitting, missing], axis=1), len(names)).astype(np.int64)
     return names, counts[:, 0], counts[:, 1]

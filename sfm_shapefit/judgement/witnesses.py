@@ -9,42 +9,37 @@ against 1 at most for right cameras, 3 at most against 42 or more for wrong ones
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.judgement.limits import CHECKED_BY, FEWEST_POINTS, FITTING_PX, OUTNUMBERED
-from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import KeypointMatches
-from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 
 
 def are_confirmed(
-    points: Points,
-    images: Images,
-    pictures: KeypointRays,
-    doubted: BoolArray,
-    matches: tuple[IntArray, Sequence[KeypointMatches]],
+    structure: Structure, doubted: BoolArray, matches: tuple[IntArray, Sequence[KeypointMatches]]
 ) -> BoolArray:
     """Return which of the doubted images (i,) stand where their pixels see the points of the others.
 
     A frame is judged by the keypoints of all its images. Whoever is confirmed makes points for the next ones.
 
     Args:
-        points: of the images.
-        images: all images; those without a pose are not confirmed.
-        pictures: keypoints and lenses of the images.
+        structure: the points of all images; those without a pose are not confirmed.
         doubted: (i,) images that are asked; others of their frames are, too.
         matches: numbers of keypoints (i,), and the matches of all pairs that the doubted images have.
     """
+    points, images = structure.points, structure.images
     asked = np.isin(images.frame_of, images.frame_of[doubted]) & images.is_posed
     left = asked
     while left.any():
         those = points.taken(points.paired(~left[points.images])).seen_by(left, *matches, least=CHECKED_BY)
         own = left[those.images]
         frames = images.frame_of[those.images[own]]
-        fits = keypoint_errors_px(those, images, pictures)[own] <= FITTING_PX
+        fits = keypoint_errors_px(replace(structure, points=those))[own] <= FITTING_PX
         fitting, missing = (
             np.bincount(frames[part], minlength=len(images.frames.ids)) for part in (fits, ~fits)
         )

@@ -23,9 +23,9 @@ from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import label_lens
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
 from sfm_shapefit.judgement.limits import OUTNUMBERED, RIVAL_SHARE, SIGMAS, SMALLEST_SHAPE
-from sfm_shapefit.scene.images import Images, KeypointRays
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE, Lens
-from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 
 # Change of the focal length, and standard deviations, beyond which that of one image is wrong, and beyond
 # which half of the images of a lens show that it is; see the header.
@@ -131,24 +131,20 @@ def _ask_for_like(left_out: LeftOut, images: Images, lens: int, rows: IntArray) 
 
 
 def question_lenses(
-    points: Points,
-    images: Images,
-    pictures: KeypointRays,
-    threads: int = 1,
-    among: BoolArray | None = None,
-    asked: BoolArray | None = None,
+    structure: Structure, threads: int = 1, asked: BoolArray | None = None
 ) -> tuple[LeftOut, tuple[ContradictedLens, ...]]:
     """Return what images say when they are left out, and the lenses that they contradict, the worst first.
 
     The rays of a wrong lens pull at the points of right ones. So what is named most clearly is taken out of
     the points of all, unless it took half of the images or more, until no other lens is named. Images not
-    `among` those that make points (i,) are asked too, if their pixels fit about as well; None: all make them.
-    Only those `asked` (i,) are left out; None: all.
+    `among` those that make points are asked too, if their pixels fit about as well. Only those `asked` (i,)
+    are left out; None: all.
     """
-    make = np.ones(images.num_images, dtype=np.bool_) if among is None else among
+    images = structure.images
+    make = np.ones(images.num_images, dtype=np.bool_) if structure.among is None else structure.among
     believed = make.copy()
     while True:
-        found = leave_one_out(points, images, pictures, threads, believed, asked)
+        found = leave_one_out(structure, threads, believed, asked)
         left_out = found.of_little_noise(make)
         wrong = wrong_lenses(left_out, images)
         fresh = [item for item in wrong if believed[images.camera_ids == item.camera].any()]

@@ -77,4 +77,5 @@ def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:
     matches = collect_matches(images, pictures, np.arange(images.num_images), links, view.num_matches)
     options = StructureOptions()
     points = triangulate(images, matches, options)
-    return Structure(filter_points(points, images, pictures, options), images, pictures)
+    structure = Structure(points, images, pictures)
+    return replace(structure, points=filter_points(structure, options))

@@ -18,6 +18,7 @@ from sfm_shapefit.judgement.reasons import IS_ITS_DATABASE, Grade, Kind, of_mode
 from sfm_shapefit.judgement.resolutions import recognize_resolution, recognize_sizes
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.scene.structure import Structure
 
 _FIRST_PAIRS = 3  # pairs of each image; those with most matches are asked
 _MOST_PAIRS = 200  # pairs that are asked at all; a second
@@ -32,7 +33,7 @@ def ask_resolution(source: MatchSource) -> Recognized | None:
         return recognize_sizes(source.images.sizes_px, matches.sizes_px())
     if isinstance(matches, TrackMatches):
         pictures = ModelKeypoints(view.images, view.keypoints, view.num_keypoints)
-        return recognize_resolution(matches.points_of(view.images), view.images, pictures)
+        return recognize_resolution(Structure(matches.points_of(view.images), view.images, pictures))
     return None
 
 

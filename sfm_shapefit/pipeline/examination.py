@@ -17,7 +17,7 @@ from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
 from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape
 from sfm_shapefit.judgement.flights import find_flights
-from sfm_shapefit.judgement.lens_residuals import find_bent_lenses
+from sfm_shapefit.judgement.lens_residuals import find_bent_lenses, lens_fields
 from sfm_shapefit.judgement.lenses import find_odd_lenses
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, SMALLEST_SHAPE
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
@@ -46,18 +46,18 @@ def gather_evidence(
 
     Images and `fits`, those of all pairs, are at the rotations of the model; None if no pair has a direction.
     """
-    points, images, pictures, among, asked = structure
-    _, lenses = question_lenses(points, images, pictures, threads, among, images_to_ask(images, asked))
+    images = structure.images
+    _, lenses = question_lenses(structure, threads, images_to_ask(images, structure.asked))
     bogus = np.array([is_bogus(lens) for lens in images.lenses], dtype=np.bool_)
-    odd = (*find_odd_lenses(images, points, pictures, bogus), *find_bent_lenses(structure))
-    odd = (*odd, *find_flights(images))
+    fields = lens_fields(structure)
+    odd = (*find_odd_lenses(structure, bogus), *find_bent_lenses(fields, images.names), *find_flights(images))
     if fits is None:
-        return ModelEvidence(lenses=lenses, odd=odd)
+        return ModelEvidence(lenses=lenses, odd=odd, fields=fields)
     odd = (*odd, *find_contradicted_rigs(images, fits.directions))
     if source.has_database and structure.has_keypoints_of(source.view):
-        given = images, points, pictures, fits.directions, source.view
-        odd = (*odd, *find_split_duplicates(*given, threads), *find_outside(images, points, pictures))
-    tied, untied = tie_images(source.view, fits, structure, source.fixed, source.tied)
+        duplicates = find_split_duplicates(structure, fits.directions, source.view, threads)
+        odd = (*odd, *duplicates, *find_outside(structure))
+    tied, untied = tie_images(source.view, fits, structure, source.fixed, source.tied, threads)
     cuts, seams = find_cuts(*fits.sides, tied), tuple[GroupApart, ...]()
     if cuts:  # which are seams by the rotations that pairs across have by themselves
         across = np.concatenate([cut.contradicting for cut in cuts])
@@ -78,6 +78,7 @@ def gather_evidence(
         untied=tuple(one for one in untied if 2 * len(apart.intersection(one.images)) < len(one.images)),
         num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)) + num_unasked,
         sides=(int(fits.agrees.sum()), int(fits.contradicts.sum())),
+        fields=fields,
     )
 
 
@@ -204,11 +205,10 @@ def ask_pixels(source: MatchSource, structure: Structure, doubted: Collection[st
 
     There are none where the model has other keypoints than the matches.
     """
-    points, images, pictures = structure[:3]
-    view = source.view
+    images, view = structure.images, source.view
     if not (doubted and structure.has_keypoints_of(view)):
         return frozenset()
     rows = images.are_named(doubted)
     links = list(view.links(chosen=np.asarray(rows[view.pairs].any(axis=1))))
-    sure = are_confirmed(points, images, pictures, rows, (view.num_keypoints, links))
+    sure = are_confirmed(structure, rows, (view.num_keypoints, links))
     return frozenset(images.names_of(np.flatnonzero(sure)))

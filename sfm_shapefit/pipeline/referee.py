@@ -98,7 +98,7 @@ def read_structure(state: CheckState, clock: Clock) -> CheckState:
     with clock("points"):
         images = state.images
         structure = structure_of(state.model.arrays, images)
-        quality = image_quality(*structure[:3])
+        quality = image_quality(structure)
         weak = tuple(find_weak_images(state.images, quality))
         return replace(state, structure=structure, quality=quality, weak=weak)
 
@@ -164,7 +164,7 @@ def grade_model(state: CheckState, clock: Clock) -> CheckState:
     if verdict.is_bad and (far := source.inputs.far):
         near = check_source(state.model, source.without(far), state.options, clock.anew()).verdict
         verdict = verdict if near.is_bad else ModelVerdict.weigh(of_alike_pictures(verdict.findings))
-    recognized, fault = recognize_resolution(*state.structure[:3]), None
+    recognized, fault = recognize_resolution(state.structure), None
     if verdict.is_bad and recognized is None:
         fault = verdict.fault_of_input(state.images.num_images)
         recognized = None if fault else ask_convention(source, clock.threads)

@@ -24,6 +24,7 @@ from sfm_shapefit.judgement.support import (
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.links import MatchedKeypoints
 
@@ -85,7 +86,9 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
         counts = PartnerCounts(images, view.num_keypoints, limit_px, state.source.fixed)
         partners = _count(links, images, counts)
         del links
-        points = filter_points(points, posed, state.pictures(images, rows), options.structure)
+        points = filter_points(
+            Structure(points, posed, state.pictures(images, rows)), options.structure, clock.threads
+        )
     if bundle is not None:
         assert points.errors_px is not None
         final = replace(bundle.solves, final_error_px=float(points.errors_px.mean()))

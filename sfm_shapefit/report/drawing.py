@@ -18,7 +18,7 @@ from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, nor
 from sfm_shapefit.facts.rows import covariances_of
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Table, contradicting, rejected
 from sfm_shapefit.files.colmap.seed import PickedPoints
-from sfm_shapefit.judgement.lens_residuals import LensField
+from sfm_shapefit.judgement.evidence import LensField
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.scene.images import Images
 

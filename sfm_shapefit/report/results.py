@@ -43,20 +43,23 @@ def draw_result(found: LocateResult | GraphResult) -> Drawing:
         input_is_aligned=isinstance(found, LocateResult) and found.gauge.scale == "input",
         history=tuple((info.iteration, info.objective, info.dual_bound) for info in placement.history),
         lenses=_lenses(found.images) if isinstance(found, LocateResult) else (),
-        fields=lens_fields(found.seed.structure) if isinstance(found, LocateResult) else (),
+        fields=found.evidence.fields if isinstance(found, LocateResult) else (),
     )
 
 
 def draw_joined(found: JoinedModel) -> Drawing:
     """Return the drawing of models that were joined."""
-    return _draw_as_it_stands(read_model(found.reconstruction), found.cameras, found.pairs)
+    model = read_model(found.reconstruction)
+    fields = lens_fields(structure_of(model.arrays, model.images))
+    return replace(_draw_as_it_stands(model, found.cameras, found.pairs), fields=fields)
 
 
 def draw_checked(found: CheckResult) -> Drawing:
     """Return the drawing of a model that was judged, with how well points hold each of its images."""
     quality, drawing = found.quality, _draw_as_it_stands(found.model, found.cameras, found.pairs)
     points = drawing.points._replace(errors_px=quality.point_errors_px, lengths=quality.point_track_lengths)
-    return replace(drawing, further=tuple(_columns(quality, len(found.cameras))), points=points)
+    further = tuple(_columns(quality, len(found.cameras)))
+    return replace(drawing, further=further, points=points, fields=found.facts.evidence.fields)
 
 
 def draw_model(model: ColmapModel, trust: Mapping[str, float]) -> Drawing:
@@ -75,11 +78,8 @@ def _draw_as_it_stands(model: ColmapModel, cameras: Table[CameraRow], pairs: Tab
     poses = poses_of(model.images, list(cameras.columns["name"]))
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
     points = pick_points(model.arrays, MAX_POINTS)
-    return replace(
-        build_drawing(cameras, pairs, poses=poses, points=points),
-        lenses=_lenses(model.images),
-        fields=lens_fields(structure_of(model.arrays, model.images)),
-    )
+    drawing = build_drawing(cameras, pairs, poses=poses, points=points)
+    return replace(drawing, lenses=_lenses(model.images))
 
 
 def _lenses(images: Images) -> tuple[LensRow, ...]:

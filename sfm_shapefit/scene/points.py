@@ -53,10 +53,11 @@ class Points(Lists):
         """Return how many observations each image has, (i,)."""
         return np.bincount(self.images, minlength=num_images).astype(np.int64)
 
-    def rows_of_images(self, num_images: int) -> list[IntArray]:
+    def rows_of_images(self, num_images: int) -> RowLists:
         """Return the observations of each image, ascending."""
         rows_of = RowLists.by_label(self.images, num_images)
-        return list(RowLists(rows_of.offsets, rows_of.rows.astype(np.int32)))
+        rows: Any = rows_of.rows.astype(np.int32)
+        return RowLists(rows_of.offsets, rows)
 
     def paired(self, chosen: BoolArray) -> BoolArray:
         """Return which observations (o,) are chosen with another one of their point."""

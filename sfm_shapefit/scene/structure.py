@@ -1,14 +1,21 @@
 """The points of a model with the images that see them."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.lists import RowLists
+from sfm_shapefit.base.row_file import Widened
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import View
 from sfm_shapefit.scene.points import Points
 
 
-class Structure(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Structure:
     """The points of a model, and what they are seen with."""
 
     points: Points
@@ -19,6 +26,23 @@ class Structure(NamedTuple):
     """(i,) images that make the points; all if None."""
     asked: BoolArray | None = None
     """(i,) images that are asked whether they contradict their lenses; all if None."""
+
+    @cached_property
+    def rows_of_images(self) -> RowLists:
+        """The observations of each image, ascending."""
+        return self.points.rows_of_images(self.images.num_images)
+
+    @cached_property
+    def pixels(self) -> Widened:
+        """Where the observations are, (o, 2); read once for all that ask."""
+        stored: npt.NDArray[np.floating] = np.empty((len(self.points.images), 2), dtype=np.float32)
+        for image, rows in enumerate(self.rows_of_images):
+            if len(rows):
+                pixels = self.pictures.pixels(image, self.points.keypoints[rows])
+                if not np.array_equal(pixels.astype(stored.dtype), pixels, equal_nan=True):
+                    stored = stored.astype(np.float64)
+                stored[rows] = pixels
+        return Widened(stored)
 
     def has_keypoints_of(self, view: View) -> bool:
         """Return whether there are points, of the keypoints that the matches have."""

@@ -4,75 +4,75 @@ In this order: observations that their camera does not see or that miss by too m
 than two; points without triangulation angle (a point that is not finite has none); short tracks.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.lists import offsets_of
-from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import batch_ranges
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.structure_options import StructureOptions
 
+_AT_ONCE = 50_000  # observations, seen through one lens, that are projected together; their arrays take 4 MB
 
-def filter_points(
-    points: Points, images: Images, pictures: KeypointRays, options: StructureOptions
-) -> Points:
-    """Return the points that satisfy the options, their observations that do, and their errors.
 
-    Args:
-        points: of the images.
-        images: where they stand.
-        pictures: of these.
-        options: what points must satisfy.
-    """
-    errors_px = keypoint_errors_px(points, images, pictures)
+def filter_points(structure: Structure, options: StructureOptions, threads: int = 1) -> Points:
+    """Return the points that satisfy the options, their observations that do, and their errors."""
+    points = structure.points
+    errors_px = keypoint_errors_px(structure, threads=threads)
     fitting = points.paired(errors_px <= options.max_reprojection_error_px)  # false for NaN
     errors_px[~fitting] = 0.0
     sums = np.bincount(points.points_seen(), errors_px, points.num_points)
     del errors_px
-    lengths = points.count(fitting)
-    is_kept = _are_wide(points, fitting, lengths, images.centers, options.min_triangulation_angle_deg)
+    lengths, centers = points.count(fitting), structure.images.centers
+    is_kept = _are_wide(points, fitting, lengths, centers, options.min_triangulation_angle_deg)
     is_kept &= lengths >= max(options.min_track_length, 1)
     points = replace(points, errors_px=sums / np.maximum(lengths, 1))
     return points.taken(fitting & is_kept[points.points_seen()])
 
 
-def keypoint_errors_px(
-    points: Points, images: Images, pictures: KeypointRays, *, ahead: bool = True
-) -> FloatArray:
+def keypoint_errors_px(structure: Structure, *, ahead: bool = True, threads: int = 1) -> FloatArray:
     """Return the distance of each observation from its point's projection, (o,); NaN where that is not seen.
 
     Not `ahead`: points behind a camera are projected too, as the formula of its lens has it.
     """
-    errors, rows_of = np.empty(len(points.images)), points.rows_of_images(images.num_images)
-    of_images = keypoint_offsets_px(points, images, pictures, enumerate(rows_of), ahead=ahead)
-    for rows, (_, offsets_px) in zip(rows_of, of_images, strict=True):
+    errors, every = np.empty(len(structure.points.images)), np.arange(structure.images.num_images)
+    for rows, offsets_px in keypoint_offsets_px(structure, every, ahead=ahead, threads=threads):
         errors[rows] = np.linalg.norm(offsets_px, axis=1)
     return errors
 
 
 def keypoint_offsets_px(
-    points: Points,
-    images: Images,
-    pictures: KeypointRays,
-    observed: Iterable[tuple[int, IntArray]],
-    *,
-    ahead: bool = True,
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield the pixels (k, 2) of some observations (k,) of each image, and the offsets of these (k, 2).
+    structure: Structure, chosen: IntArray, *, ahead: bool = True, threads: int = 1
+) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Yield the observations (k,) of chosen images, one after the other, some at a time, and their offsets.
 
-    An offset leads from the keypoint to where its point is projected, as in `keypoint_errors_px`.
+    An offset (k, 2) leads from the keypoint to where its point is projected, as in `keypoint_errors_px`.
     """
-    seen, rotations, centers = points.points_seen(), images.rotations, images.centers
-    for image, rows in observed:
-        with np.errstate(invalid="ignore"):  # a point that is not finite
-            in_camera = (points.xyz[seen[rows]] - centers[image]) @ rotations[image].T
-        found = pictures.project(image, in_camera, ahead=ahead)
-        pixels = pictures.pixels(image, points.keypoints[rows])
-        yield pixels, images.lenses[images.lens_of[image]].offsets_px(found, pixels)
+    points, images, rows_of = structure.points, structure.images, structure.rows_of_images
+    seen, rotations, centers, pixels = (
+        points.points_seen(),
+        images.rotations,
+        images.centers,
+        structure.pixels,
+    )
+
+    def project(some: IntArray) -> tuple[IntArray, FloatArray]:
+        observed, lens = rows_of.subset(some), images.lenses[images.lens_of[some[0]]]
+        in_camera = points.xyz[seen[observed.rows]]
+        for image, own in zip(some.tolist(), observed.slices(), strict=True):
+            with np.errstate(invalid="ignore"):  # a point that is not finite
+                in_camera[own] = (in_camera[own] - centers[image]) @ rotations[image].T
+        found = structure.pictures.project(int(some[0]), in_camera, ahead=ahead)
+        return observed.rows, lens.offsets_px(found, pixels[observed.rows])
+
+    part = np.cumsum(rows_of.lengths()[chosen]) // _AT_ONCE
+    cuts = np.flatnonzero((np.diff(part) != 0) | (np.diff(images.lens_of[chosen]) != 0)) + 1
+    return in_threads(threads, project, np.split(chosen, cuts) if len(chosen) else ())
 
 
 def _are_wide(

@@ -18,7 +18,7 @@ from sfm_shapefit.base.executors import gathered, in_ranges
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.lists import Lists, RowLists
-from sfm_shapefit.base.row_file import Gathered, AnyRows
+from sfm_shapefit.base.row_file import AnyRows, Gathered
 from sfm_shapefit.scene.epipolar import sampson_px, write_ray
 from sfm_shapefit.tracks.joining import list_trees
 

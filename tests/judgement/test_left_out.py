@@ -12,6 +12,7 @@ from sfm_shapefit.scene.images import Frames, Images, Sensors
 from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE, Lens, Origin
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 from tests.adjustment.made import look_at
 
 NUM_IMAGES, FOCAL_PX = 12, 1000.0
@@ -85,7 +86,10 @@ class Scene:
         return np.concatenate([np.sin(angle) * plane / angle, np.cos(angle)], axis=1)
 
     def left_out(self, threads=1):
-        return leave_one_out(self.points, self.images, self, threads)
+        return leave_one_out(self.structure(), threads)
+
+    def structure(self, points=None, among=None):
+        return Structure(points or self.points, self.images, self, among)
 
 
 def test_right_lenses_change_by_as_much_as_the_noise_says():
@@ -113,7 +117,7 @@ def test_the_rays_of_a_wrong_lens_make_no_right_one_look_wrong():
     scene = Scene(noise_px=0.1, factors=[1.3, 1.0, 0.8])
     once = wrong_lenses(scene.left_out(), scene.images)
     assert {0, 2} <= {wrong.camera for wrong in once}
-    left_out, wrong = question_lenses(scene.points, scene.images, scene)
+    left_out, wrong = question_lenses(scene.structure())
     assert {item.camera: round(item.factor, 2) for item in wrong} == {0: 1.3, 2: 0.8}
     right = np.setdiff1d(np.arange(NUM_IMAGES), [0, 2])
     assert np.abs(left_out.log_factors[right]).max() < 0.003
@@ -135,7 +139,7 @@ def test_an_image_that_makes_no_points_is_asked_if_its_pixels_fit(noisy):
     seen = alone.seen_by(~among, keypoints, [links])
     assert seen.count_seen(NUM_IMAGES).tolist() == [points.num_points] * NUM_IMAGES
     assert (seen.keypoints == seen.points_seen()).all()  # each image numbers them as they are
-    _, wrong = question_lenses(seen, scene.images, scene, among=among)
+    _, wrong = question_lenses(scene.structure(seen, among))
     assert [item.camera for item in wrong] == ([] if noisy else [3])
     assert noisy or wrong[0].factor == pytest.approx(1.2, abs=0.015)
 
@@ -180,7 +184,7 @@ def test_a_lens_of_all_images_is_wrong_if_they_ask_for_unlike_ones():
     right = Scene(shared=True)
     assert wrong_lenses(right.left_out(), right.images) == ()
     unlike = Scene(shared=True, factors=np.tile([0.95, 1.05], NUM_IMAGES // 2))
-    _, (wrong,) = question_lenses(unlike.points, unlike.images, unlike)
+    _, (wrong,) = question_lenses(unlike.structure())
     assert (wrong.camera, wrong.num_images) == (0, NUM_IMAGES)
     assert wrong.factor == pytest.approx(1.0, abs=0.02)
     assert 0.02 < wrong.sigma < 0.1
@@ -189,18 +193,18 @@ def test_a_lens_of_all_images_is_wrong_if_they_ask_for_unlike_ones():
 def test_few_observations_say_nothing_and_nor_do_points_that_nobody_else_holds():
     scene = Scene()
     few = scene.points.taken((scene.points.images != 2) | (scene.points.points_seen() < 14))
-    found = leave_one_out(few, scene.images, scene)
+    found = leave_one_out(scene.structure(few))
     assert found.num_observations[2] == 14
     assert np.isnan(found.log_factors).tolist() == [k == 2 for k in range(NUM_IMAGES)]
     pairs = scene.points.taken(scene.points.images < 2)
-    assert (leave_one_out(pairs, scene.images, scene).num_observations == 0).all()
+    assert (leave_one_out(scene.structure(pairs)).num_observations == 0).all()
 
 
 def test_neither_threads_nor_which_others_are_asked_change_a_bit():
     scene = Scene(factors=[0.8, 1.1])
     once, twice = scene.left_out(1), scene.left_out(5)
     asked = np.arange(scene.images.num_images) == 1
-    alone = leave_one_out(scene.points, scene.images, scene, asked=asked)
+    alone = leave_one_out(scene.structure(), asked=asked)
     for name in ("num_observations", "log_factors", "sigmas", "free_shares", "noise_px"):
         assert getattr(once, name).tobytes() == getattr(twice, name).tobytes()
         assert getattr(alone, name)[asked].tobytes() == getattr(once, name)[asked].tobytes()

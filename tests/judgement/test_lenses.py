@@ -7,6 +7,7 @@ from sfm_shapefit.judgement.lenses import find_odd_lenses, measure_lens
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 
 WIDTH, HEIGHT = 1600, 1200
 MIDDLE = (800.0, 600.0)
@@ -100,7 +101,7 @@ def odd(focals, names):
         for k, f in enumerate(focals)
     ]
     images = Images.listed(names, (np.tile(np.eye(3), (count, 1, 1)), np.eye(count, 3)), range(count), lenses)
-    return list(find_odd_lenses(images, NO_POINTS, None, np.zeros(count, dtype=np.bool_)))
+    return list(find_odd_lenses(Structure(NO_POINTS, images, None), np.zeros(count, dtype=np.bool_)))
 
 
 @pytest.mark.parametrize("scatter", [0.02, 0.3])

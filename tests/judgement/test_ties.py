@@ -21,7 +21,7 @@ INNER = 40
 def rays_of(*seen, misses=(), by=range(RIVAL_SHARE, N)):
     """Rays of points, each seen by a tuple of cameras; those of some points miss in some cameras."""
     points, nodes = np.repeat(np.arange(len(seen)), [len(each) for each in seen]), np.concatenate(seen)
-    return Rays(points, nodes, ~(np.isin(nodes, by) & np.isin(points, list(misses))))
+    return Rays(points, nodes, ~(np.isin(nodes, by) & np.isin(points, list(misses)))).of_three()
 
 
 def halves():
@@ -38,12 +38,12 @@ def names_of(inside):
     return tuple(map(str, np.flatnonzero(inside).tolist()))
 
 
-def found(*crossing, agreeing=(), contradicting=(), known=(), inside=None, misses=(), **more):
+def found(*crossing, agreeing=(), contradicting=(), known=(), inside=None, misses=(), threads=1, **more):
     """The groups of two halves that points, and pairs, cross."""
     points = halves() if inside is None else inside
     rays = rays_of(*points, *crossing, misses=[len(points) + k for k in misses], **more)
     sides = (np.array(side, dtype=int).reshape(-1, 2) for side in (agreeing, contradicting))
-    group = rigid_groups(N, rays, np.array(known, dtype=int).reshape(-1, 2))
+    group = rigid_groups(N, rays, np.array(known, dtype=int).reshape(-1, 2), threads)
     return find_groups(group, rays, links_of_pairs(*sides), names_of)
 
 
@@ -142,7 +142,8 @@ def test_points_are_counted_some_at_a_time_with_the_same_groups(monkeypatch):
     at_once = found(*crossing, misses=range(7))[0]
     monkeypatch.setattr(ties, "_LINKS_A_BLOCK", 10)
     assert len(list(rays_of(*halves()).blocks())) > 100
-    assert np.array_equal(found(*crossing, misses=range(7))[0], at_once)
+    for threads in (1, 3):
+        assert np.array_equal(found(*crossing, misses=range(7), threads=threads)[0], at_once)
     assert len(found(*crossing, misses=range(9))[1]) == 1
 
 

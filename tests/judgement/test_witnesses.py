@@ -24,7 +24,7 @@ def confirmed(scene, matched, doubted=(3,), num_keypoints=200):
     )
     asked = np.isin(np.arange(NUM_IMAGES), doubted)
     counts = np.full(NUM_IMAGES, scene.points.num_points)
-    found = are_confirmed(scene.points, scene.images, scene, asked, (counts, [links]))
+    found = are_confirmed(scene.structure(), asked, (counts, [links]))
     return np.flatnonzero(found).tolist()
 
 

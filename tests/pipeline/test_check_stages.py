@@ -104,7 +104,7 @@ def test_a_single_camera_that_another_model_has_elsewhere_counts_unless_the_pixe
         state = state_of(source, fits=fit_pairs(TRUTH.centers, directions))
         if not confirmed:
             points = replace(state.structure.points, xyz=-state.structure.points.xyz)
-            state = replace(state, structure=state.structure._replace(points=points))
+            state = replace(state, structure=replace(state.structure, points=points))
         other = OtherModel(others, fits, np.zeros(8, dtype=np.bool_), ring_mapped, 0)
         second = compare_with_other(replace(state, other=other)).evidence.second
         assert compare_with_other(state) is state

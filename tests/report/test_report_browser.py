@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.judgement.lens_residuals import LensField
+from sfm_shapefit.judgement.evidence import LensField
 from sfm_shapefit.report.matched import DrawnMatches
 from sfm_shapefit.report.page import Pictures, write_report
 from tests.browser import chromium, complaints, opened, requests, wait_for
