@@ -44,6 +44,13 @@ def in_ranges(threads: int, count: int, work: Callable[..., object], *given: obj
         pass
 
 
+def in_slices(threads: int, count: int, size: int, work: Callable[..., object], *given: object) -> None:
+    """Call `work(begin, end, *given)` for slices of `size` items, which do not depend on the threads."""
+    cuts = [(begin, min(begin + size, count)) for begin in range(0, count, size)]
+    for _ in in_threads(min(threads, len(cuts)), lambda cut: work(*cut, *given), cuts):
+        pass
+
+
 def gathered(threads: int, array: AnyArray, rows: IntArray) -> AnyArray:
     """Return array[rows]; threads share the rows."""
     found: AnyArray = np.empty_like(array, shape=(len(rows), *array.shape[1:]))

@@ -73,7 +73,8 @@ class MeasuredGraph:
     @property
     def is_pair(self) -> BoolArray:
         """(m,) whether an edge joins two cameras; the others join a camera and a point."""
-        return np.asarray((self.graph.edges < self.num_cameras).all(axis=1))
+        first, second = self.graph.edges.T < self.num_cameras
+        return np.asarray(first & second)
 
     @property
     def pairs(self) -> IntArray:

@@ -29,10 +29,11 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, quantile
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, frozen, quantile
 from sfm_shapefit.base.damping import DampingRange, take_damped_step
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import median_spread, tangent_bases
+from sfm_shapefit.base.executors import in_slices
+from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.losses import ARCTANGENT, GEMAN_MCCLURE, loss, weighed
 from sfm_shapefit.base.scipy_parts import chdtri
@@ -46,7 +47,7 @@ from sfm_shapefit.laplacian.factor import (
     analyze,
 )
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
-from sfm_shapefit.solver.program import adjoint, differences
+from sfm_shapefit.solver.program import SLICE, adjoint, measure_baselines
 from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor, predict_factor
 
 KERNEL_WIDTH = 3.0
@@ -125,20 +126,19 @@ def refine_angles(
         threads: of the factor, if `plan` is one's plan.
     """
     graph, classes = measured.graph, measured.classes
-    factor, spread = allocate_normal(plan, graph.dimension, threads), _spread(measured)
-    first = unit_norm(start)
+    factor, first = allocate_normal(plan, graph.dimension, threads), unit_norm(start)
     other = None if other is None else unit_norm(other)
     t, damping, steps = first, DAMPING.first, 0
     still = _STILL_PER_LEVEL if isinstance(plan, IterativeNormal) else 0.0
     moves_singly = isinstance(plan, FactorPlan | IterativeNormal)
     levels = np.full(int(classes.max()) + 1, _FIRST_LEVEL_RAD)
-    information = _information(graph, spread, levels[classes])
+    information = _information(measured, levels[classes], threads)
     while steps < _MAX_STEPS:
         lower = np.clip(residual_levels(measured, t, levels), levels / 2.0, levels)
         settled = bool((lower >= (1.0 - _SETTLED) * levels).all())
         if not settled:
-            levels, information = lower, _information(graph, spread, lower[classes])
-        terms = AngularTerms(graph, information, ARCTANGENT if settled else GEMAN_MCCLURE)
+            levels, information = lower, _information(measured, lower[classes], threads)
+        terms = AngularTerms(graph, information, ARCTANGENT if settled else GEMAN_MCCLURE, threads)
         moved, damping, before, after = take_angular_step(terms, factor, t, damping)
         is_still = (
             _motion(t, moved) <= max(_STILL, still * levels.min()) or before - after <= _CONVERGED * before
@@ -148,7 +148,7 @@ def refine_angles(
             break
         if settled and other is not None and _is_decided(before, after, terms.cost(other)):
             break
-    terms = AngularTerms(graph, information)
+    terms = AngularTerms(graph, information, threads=threads)
     cost, first_cost = terms.cost(t), terms.cost(first)
     if first_cost < cost:
         t, cost = first, first_cost
@@ -168,20 +168,19 @@ def robust_cost(measured: MeasuredGraph, locations: FloatArray, levels: FloatArr
 class AngularTerms:
     """The robust cost of the directions, each with its own M_e, and its normal equations."""
 
-    def __init__(self, graph: ViewGraph, information: FloatArray, kind: int = ARCTANGENT) -> None:
-        """Take M_e, (m, d, d), and the kind of the loss, see `base.losses`."""
-        self._graph, self._information, self._kind = graph, information, kind
+    def __init__(
+        self, graph: ViewGraph, information: FloatArray, kind: int = ARCTANGENT, threads: int = 1
+    ) -> None:
+        """Take M_e, (m, d, d), and the kind of the loss, see `base.losses`; threads share the pairs."""
+        self._graph, self._information, self._kind, self._threads = graph, information, kind, threads
 
     def cost(self, t: FloatArray) -> float:
         """Return the sum of the kernel over the pairs at locations (n, d) of any scale."""
-        return float(_sum_of_kernels(*self._arguments(t)))
+        return self._evaluate(t, 0)[0]
 
     def linearize(self, t: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
         """Return the cost, normal blocks (m, d, d), their damping (m,), and the gradient (m, d)."""
-        (m, d), arguments = self._graph.directions.shape, self._arguments(t)
-        out = np.empty((m, d, d)), np.empty(m), np.empty((m, d))
-        _linearize_pairs(*arguments, out)
-        return float(_sum_of_kernels(*arguments)), *out
+        return self._evaluate(t, self._graph.num_edges)
 
     def normal_equations(self, t: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
         """Return the cost, the blocks, the damping, and the right-hand side (n, d) of a step from t."""
@@ -192,12 +191,15 @@ class AngularTerms:
         """Return the locations (n, d) after a step from t."""
         return unit_norm(t + step)
 
-    def _arguments(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float, int]:
-        """Return what the kernels take: baselines, v, w, M, the floor under |d|, and the kind of loss."""
-        graph = self._graph
-        baselines = differences(t, graph.edges)
-        floor = _SHORTEST * float(np.median(np.linalg.norm(baselines, axis=1)))
-        return baselines, graph.directions, graph.weights, self._information, floor, self._kind
+    def _evaluate(self, t: FloatArray, rows: int) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+        """Return what `linearize` does, with so many rows: all, or none where the cost is enough."""
+        graph, d, m = self._graph, self._graph.dimension, self._graph.num_edges
+        baselines, lengths = measure_baselines(t, graph.edges, self._threads)
+        given = baselines, lengths, graph.directions, graph.weights, self._information
+        how = _SHORTEST * float(np.median(lengths)), self._kind
+        sums, out = np.zeros(m // SLICE + 1), (np.empty((rows, d, d)), np.empty(rows), np.empty((rows, d)))
+        in_slices(self._threads, m, SLICE, _linearize_pairs, given, how, sums, out)
+        return float(sums.sum()), *out
 
 
 def allocate_normal(plan: FactorPlan | LaplacianFactor, dimension: int, threads: int = 1) -> LaplacianFactor:
@@ -262,32 +264,17 @@ def residual_levels(
 
 def information_at(measured: MeasuredGraph, levels: FloatArray) -> FloatArray:
     """Return M_e, (m, d, d), at the level of each class, (number of classes,) in radians."""
-    return _information(measured.graph, _spread(measured), levels[measured.classes])
+    return _information(measured, levels[measured.classes])
 
 
-def _spread(measured: MeasuredGraph) -> tuple[FloatArray, FloatArray] | None:
-    """Return the axes (m, d, d - 1) and variances (m, d - 1) of each direction; None if all are unknown.
-
-    A covariance that is not finite is unknown, and counts as 0: the level alone speaks for the pair.
-    """
-    covariance = measured.covariance
-    if covariance is None:
-        return None
-    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
-    variances, axes = np.linalg.eigh(np.where(finite.reshape(-1, 1, 1), covariance, 0.0))
-    return np.asarray(tangent_bases(measured.graph.directions) @ axes), np.maximum(variances, 0.0)
-
-
-def _information(
-    graph: ViewGraph, spread: tuple[FloatArray, FloatArray] | None, level: FloatArray
-) -> FloatArray:
+def _information(measured: MeasuredGraph, level: FloatArray, threads: int = 1) -> FloatArray:
     """Return M_e, (m, d, d), for the level s of each pair, (m,)."""
-    m, d = graph.directions.shape
-    if spread is None:
+    (m, d), covariance = measured.graph.directions.shape, measured.covariance
+    if covariance is None:
         return np.asarray(np.eye(d) / level[:, None, None] ** 2)
-    information = np.empty((m, d, d))
-    _inform(*spread, graph.directions, level, information)
-    return information
+    out = np.empty((m, d, d))
+    in_slices(threads, m, SLICE, _inform, frozen(covariance), measured.graph.directions, level, out)
+    return out
 
 
 def unit_norm(t: FloatArray) -> FloatArray:
@@ -313,76 +300,67 @@ def _motion(t: FloatArray, moved: FloatArray) -> float:
 
 def _residuals(graph: ViewGraph, t: FloatArray) -> FloatArray:
     """Return u_e - v_e, (m, d)."""
-    baselines = differences(t, graph.edges)
-    lengths = np.linalg.norm(baselines, axis=1, keepdims=True)
-    units = baselines / np.maximum(lengths, _SHORTEST * np.median(lengths))
+    baselines, lengths = measure_baselines(t, graph.edges)
+    units = baselines / np.maximum(lengths, _SHORTEST * np.median(lengths))[:, None]
     return np.asarray(units - graph.directions)
 
 
 @kernel
-def _inform(axes: Any, variances: Any, v: Any, level: Any, out: Any) -> None:
-    """Write sum_a q_a q_a^T / (variance_a + level^2) + m v v^T."""
-    m, d = v.shape
-    for e in range(m):
-        out[e] = 0.0
-        mean = 0.0
-        for k in range(d - 1):
-            inverse = 1.0 / (variances[e, k] + level[e] ** 2)
-            mean += inverse / (d - 1)
+def _inform(begin: int, end: int, covariance: Any, v: Any, level: Any, out: Any) -> None:
+    """Write B (Sigma + level^2 I)^-1 B^T + m v v^T of the pairs begin..end-1, B as of `tangent_bases`.
+
+    A covariance that is not finite is unknown, and counts as 0: the level alone speaks for the pair.
+    """
+    d = v.shape[1]
+    basis, inverse = np.empty((d, d - 1)), np.empty((d - 1, d - 1))
+    for e in range(begin, end):
+        sign = -1.0 if v[e, 0] < 0.0 else 1.0
+        is_known, factor, mean = True, 2.0 / (2.0 + 2.0 * abs(v[e, 0])), 0.0
+        for p in range(d - 1):
             for a in range(d):
-                for b in range(d):
-                    out[e, a, b] += inverse * axes[e, a, k] * axes[e, b, k]
+                mirrored = v[e, 0] + sign if a == 0 else v[e, a]
+                basis[a, p] = (1.0 if a == p + 1 else 0.0) - factor * mirrored * v[e, p + 1]
+            for q in range(d - 1):
+                is_known = is_known and np.isfinite(covariance[e, p, q])
+        for p in range(d - 1):
+            for q in range(d - 1):
+                inverse[p, q] = covariance[e, p, q] if is_known else 0.0
+            inverse[p, p] += level[e] ** 2
+        for p in range(d - 1):  # Gauss and Jordan's elimination, in place
+            pivot, inverse[p, p] = inverse[p, p], 1.0
+            for q in range(d - 1):
+                inverse[p, q] /= pivot
+            for a in range(d - 1):
+                if a != p:
+                    pivot, inverse[a, p] = inverse[a, p], 0.0
+                    for q in range(d - 1):
+                        inverse[a, q] -= pivot * inverse[p, q]
+        for p in range(d - 1):
+            mean += inverse[p, p] / (d - 1)
         for a in range(d):
             for b in range(d):
-                out[e, a, b] += mean * v[e, a] * v[e, b]
+                total = mean * v[e, a] * v[e, b]
+                for p in range(d - 1):
+                    for q in range(d - 1):
+                        total += basis[a, p] * inverse[p, q] * basis[b, q]
+                out[e, a, b] = total
 
 
 @kernel
-def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: float, kind: int) -> float:
-    """Return sum_e w_e / 2 * k^2 rho(chi2 / k^2) for a kind of loss rho."""
-    m, d = v.shape
-    total = 0.0
-    residual = np.empty(d)
-    for e in range(m):
-        length = 0.0
-        for a in range(d):
-            length += baselines[e, a] ** 2
-        length = max(np.sqrt(length), floor)
-        for a in range(d):
-            residual[a] = baselines[e, a] / length - v[e, a]
-        chi2 = 0.0
-        for a in range(d):
-            for b in range(d):
-                chi2 += residual[a] * information[e, a, b] * residual[b]
-        x = chi2 / KERNEL_WIDTH**2
-        total += 0.5 * w[e] * KERNEL_WIDTH**2 * loss(kind, x)
-    return total
+def _linearize_pairs(begin: int, end: int, given: Any, how: Any, sums: Any, out: Any) -> None:
+    """Write the sum of w / 2 * k^2 rho(chi2 / k^2) over a slice; where there is room, what each pair adds.
 
-
-@kernel
-def _linearize_pairs(
-    baselines: Any, v: Any, w: Any, information: Any, floor: float, kind: int, out: Any
-) -> None:
-    """Write J^T M J, the damping's weight, and J^T M r of each pair, times the kernel's weight.
-
+    That is J^T M J, the damping's weight, and J^T M r, times the kernel's weight, of the pairs begin..end-1.
     J = (I - u u^T) / |d|, and I / floor where |d| is below the floor, for u = d / floor there.
     """
-    blocks, damped, gradient = out
-    m, d = v.shape
+    (baselines, lengths, v, w, information), (floor, kind), (blocks, damped, gradient) = given, how, out
+    d, total = v.shape[1], 0.0
     u, pull = np.empty(d), np.empty(d)
     across, half = np.empty((d, d)), np.empty((d, d))
-    for e in range(m):
-        length = 0.0
-        for a in range(d):
-            length += baselines[e, a] ** 2
-        radial = 1.0 if length > floor * floor else 0.0
-        length = max(np.sqrt(length), floor)
+    for e in range(begin, end):
+        length, chi2, trace = max(lengths[e], floor), 0.0, 0.0
         for a in range(d):
             u[a] = baselines[e, a] / length
-        for a in range(d):
-            for b in range(d):
-                across[a, b] = ((1.0 if a == b else 0.0) - radial * u[a] * u[b]) / length
-        chi2, trace = 0.0, 0.0
         for a in range(d):
             pull[a] = 0.0
             for b in range(d):
@@ -390,13 +368,21 @@ def _linearize_pairs(
             chi2 += (u[a] - v[e, a]) * pull[a]
             trace += information[e, a, a]
         x = chi2 / KERNEL_WIDTH**2
+        total += 0.5 * w[e] * KERNEL_WIDTH**2 * loss(kind, x)
+        if len(damped) == 0:
+            continue
+        radial = 1.0 if lengths[e] > floor else 0.0
         weight = weighed(kind, w[e], x)
         damped[e] = w[e] * trace / (d * length * length)
+        for a in range(d):
+            for b in range(d):
+                across[a, b] = ((1.0 if a == b else 0.0) - radial * u[a] * u[b]) / length
         for a in range(d):
             gradient[e, a] = 0.0
             for b in range(d):
                 gradient[e, a] += weight * across[a, b] * pull[b]
         _congruence(weight, across, information[e], half, blocks[e])
+    sums[begin // SLICE] = total
 
 
 @inner_kernel

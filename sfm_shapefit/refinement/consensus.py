@@ -25,12 +25,13 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.executors import in_slices
 from sfm_shapefit.base.jit import inner_kernel, kernel, mix_bits
 from sfm_shapefit.base.scipy_parts import expit, gammaln, logit
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.program import SLICE, measure_baselines
 
 _EM_ROUNDS = 60  # rounds of the mixture; share and width settle in fewer
 _SHARES = (0.02, 0.999)  # least and largest share of right pairs; at 0 and 1 nothing is learned any more
@@ -76,27 +77,29 @@ class ResidualMixture:
 
 def residual_angles(graph: ViewGraph, locations: FloatArray) -> FloatArray:
     """Return the angle between each direction and its baseline, (m,) radians; 60 deg where there is none."""
-    baselines = differences(locations, graph.edges)
-    lengths = np.linalg.norm(baselines, axis=1, keepdims=True)
-    chords = np.linalg.norm(baselines / np.maximum(lengths, _SHORT) - graph.directions, axis=1)
+    baselines, lengths = measure_baselines(locations, graph.edges)
+    chords = np.linalg.norm(baselines / np.maximum(lengths, _SHORT)[:, None] - graph.directions, axis=1)
     return np.asarray(2.0 * np.arcsin(np.minimum(0.5 * chords, 1.0)))
 
 
-def fit_mixture(measured: MeasuredGraph, locations: FloatArray) -> ResidualMixture:
+def fit_mixture(measured: MeasuredGraph, locations: FloatArray, threads: int = 1) -> ResidualMixture:
     """Fit share and level of the right pairs of each class to the residuals at locations (n, d)."""
     graph, classes, own = measured.graph, measured.classes, own_variances(measured)
     angles, d, count = residual_angles(graph, locations), graph.dimension, int(classes.max()) + 1
+    peak, given = np.exp(log_ratio(0.0, 1.0, d)), (classes, angles, own)
     numbers = np.maximum(np.bincount(classes, minlength=count), 1)
     shares = np.full(count, 0.5)
     levels2 = np.array([np.median(angles[classes == k]) ** 2 if k in classes else 1.0 for k in range(count)])
     for _ in range(_EM_ROUNDS):
         before, levels2 = (shares, levels2), np.clip(levels2, *_LEVELS2)
-        total, odds = levels2[classes] + own, logit(shares)[classes]
-        right = expit(log_ratio(angles, total, d) + odds)
-        shares = np.clip(np.bincount(classes, right, count) / numbers, *_SHARES)
+        sums = np.zeros((len(angles) // SLICE + 1, 3, count))
+        in_slices(
+            threads, len(angles), SLICE, _add_right, given, (levels2, peak * shares / (1.0 - shares)), d, sums
+        )
+        right, wanted, inverse = sums.sum(axis=0)
+        shares = np.clip(right / numbers, *_SHARES)
         # Stationary where sum right (A^2 / (d - 1) - total) / total^2 = 0; without variances their mean.
-        wanted = np.bincount(classes, right * (angles / total) ** 2, count) / (d - 1)
-        levels2 = levels2 * wanted / np.maximum(np.bincount(classes, right / total, count), _TINY)
+        levels2 = levels2 * wanted / (d - 1) / np.maximum(inverse, _TINY)
         if np.allclose(before, (shares, levels2), rtol=_SETTLED, atol=0.0):
             break
     total, odds = np.clip(levels2, *_LEVELS2)[classes] + own, logit(shares)[classes]
@@ -113,6 +116,23 @@ def fit_mixture(measured: MeasuredGraph, locations: FloatArray) -> ResidualMixtu
     )
 
 
+@kernel
+def _add_right(begin: int, end: int, given: Any, model: Any, dimension: int, sums: Any) -> None:
+    """Add up a slice's posteriors of being right, times 1, A^2 / s^4 and 1 / s^2, (3, number of classes)."""
+    (classes, angles, own), (levels2, odds) = given, model
+    there = sums[begin // SLICE]
+    for e in range(begin, end):
+        k = classes[e]
+        total = levels2[k] + own[e]
+        ratio = odds[k] * np.exp(-0.5 * angles[e] ** 2 / total)
+        for _ in range(dimension - 1):
+            ratio /= np.sqrt(total)
+        right = 1.0 / (1.0 + 1.0 / ratio)
+        there[0, k] += right
+        there[1, k] += right * (angles[e] / total) ** 2
+        there[2, k] += right / total
+
+
 def own_variances(measured: MeasuredGraph) -> FloatArray:
     """Return the variance per axis that each direction states itself, (m,); 0 where it states none."""
     if measured.covariance is None:
@@ -121,7 +141,7 @@ def own_variances(measured: MeasuredGraph) -> FloatArray:
     return np.asarray(np.where(np.isfinite(variances), np.maximum(variances, 0.0), 0.0))
 
 
-def log_ratio(angles: FloatArray, variances: FloatArray | float, dimension: int) -> FloatArray:
+def log_ratio(angles: FloatArray | float, variances: FloatArray | float, dimension: int) -> FloatArray:
     """Return the log density of directions off by `angles`, over the uniform one of the sphere, (m,)."""
     sphere = np.log(2.0) + 0.5 * dimension * np.log(np.pi) - gammaln(0.5 * dimension)
     peak = sphere - 0.5 * (dimension - 1) * np.log(2.0 * np.pi * np.asarray(variances))

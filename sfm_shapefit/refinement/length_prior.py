@@ -13,15 +13,19 @@ at most the n observations do. The ratio is below .8 on orbits, domes, corridors
 Source: Kish, "Survey Sampling", 1965, section 8.2. The averages along a graph are our own.
 """
 
+from typing import Any
+
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.operators import LaplacianOperator, Workers, adjacency
+from sfm_shapefit.laplacian.operators import adjacency
 
 _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; others are of collapsed scenes
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
-_SIZES = (1, 2, 4, 8, 16, 32, 64)  # averages with the neighbors; 64 more say little more, and cost as much
+_SIZES = np.array([1, 2, 4, 8, 16, 32, 64])
+"""Averages with the neighbors; 64 more say little more, and cost as much."""
 _PROBES = 8  # vectors of signs; their mean square is known to a few percent then
 
 
@@ -30,31 +34,48 @@ class LengthPrior:
 
     def __init__(self, graph: ViewGraph) -> None:
         """Measure how far averages cancel independent signs."""
-        m = graph.num_edges
-        self._edges, self._degrees = graph.edges, graph.degrees().astype(np.float64)
-        self._laplacian = LaplacianOperator(adjacency(graph.num_nodes, graph.edges), np.ones(m), Workers(1))
+        m, around = graph.num_edges, adjacency(graph.num_nodes, graph.edges)
+        self._graph, self._around = graph, (around.pointers, around.neighbors, around.edge_of)
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (m, _PROBES))
-        self._independent = np.mean(self._averages(signs), axis=1) * m / graph.num_nodes
+        self._independent = np.mean(self._averages(signs - signs.mean(axis=0)), axis=1) * m / graph.num_nodes
 
-    def variance(self, lengths: FloatArray) -> float:
-        """Return that of the log of one of m lengths."""
-        logs = np.log(lengths)
+    def variance(self, logs: FloatArray) -> float:
+        """Return that of one of m log lengths."""
         tau = np.clip(_SPREAD * np.mean(np.abs(logs - np.median(logs))), *_TAUS)
         return float(tau**2)
 
-    def design_effect(self, lengths: FloatArray) -> float:
-        """Return how many observations count as one, at least 1."""
-        averages = self._averages(np.log(lengths)[:, None])[:, 0]
-        return float(max(1.0, (averages / self._independent).max() / self.variance(lengths)))
+    def design_effect(self, logs: FloatArray) -> float:
+        """Return how many observations count as one, at least 1, of log lengths (m,) less their mean."""
+        averages = self._averages(logs[:, None])[:, 0]
+        return float(max(1.0, (averages / self._independent).max() / self.variance(logs)))
+
+    def precisions(self, logs: FloatArray) -> tuple[float, float]:
+        """Return 1 / variance of log lengths (m,) less their mean, and that of independent cameras."""
+        unit = self._graph.num_nodes / len(logs) / self.variance(logs)
+        return unit / self.design_effect(logs), unit
 
     def _averages(self, of_pairs: FloatArray) -> FloatArray:
         """Return the mean square, over cameras, of averages of columns (m, k), (number of sizes, k)."""
-        ends, n, total = self._edges.ravel(), len(self._degrees), self._degrees.sum()
-        centered = of_pairs - of_pairs.mean(axis=0)
-        sums = [np.bincount(ends, np.repeat(column, 2), n) for column in centered.T]
-        means, found = np.stack(sums, axis=1) / self._degrees[:, None], []
-        for step in range(_SIZES[-1] + 1):
-            if step in _SIZES:
-                found.append(self._degrees @ means**2 / total)
-            means = means - 0.5 * self._laplacian(means) / self._degrees[:, None]
-        return np.asarray(found)
+        means = np.empty((2, self._graph.num_nodes, of_pairs.shape[1]))
+        found = np.zeros((len(_SIZES), of_pairs.shape[1]))
+        _average(self._around, of_pairs, _SIZES, means, found)
+        return found / (2.0 * len(of_pairs))
+
+
+@kernel
+def _average(around: Any, of_pairs: Any, sizes: Any, means: Any, found: Any) -> None:
+    """Add up the squares of averages over neighborhoods, each as often as its camera has pairs."""
+    pointers, neighbors, edge_of = around
+    size = 0
+    for step in range(sizes[-1] + 1):
+        before, now = means[(step + 1) % 2], means[step % 2]
+        for i in range(len(pointers) - 1):
+            degree = pointers[i + 1] - pointers[i]
+            for k in range(now.shape[1]):
+                total = 0.0
+                for p in range(pointers[i], pointers[i + 1]):
+                    total += of_pairs[edge_of[p], k] if step == 0 else before[i, k] - before[neighbors[p], k]
+                now[i, k] = total / degree if step == 0 else before[i, k] - 0.5 * total / degree
+                if step == sizes[size]:
+                    found[size, k] += degree * now[i, k] ** 2
+        size += step == sizes[size]

@@ -45,6 +45,7 @@ Sources: Louis, "Finding the observed information matrix when using the EM algor
 al., "Graduated non-convexity for robust spatial perception", RA-L 2020. The prior of lengths is our own.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -62,7 +63,7 @@ from sfm_shapefit.laplacian.factor import FactorPlan, allocate_factor
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.refinement.consensus import put_by_consensus
 from sfm_shapefit.refinement.length_prior import LengthPrior
-from sfm_shapefit.solver.program import adjoint, differences
+from sfm_shapefit.solver.program import SLICE, adjoint, measure_baselines
 
 _LEVELS_RAD = (1e-7, 0.25)  # radians; noise below is none, and beyond nothing is known of a direction
 _NODES = np.linspace(-4.0, 4.0, 13)  # standard scores of log levels; finer sums of their density say the same
@@ -84,7 +85,6 @@ _RIDGE = 1e-9  # share of each block's trace that is added to its diagonal; abov
 _DAMPING = DampingRange(1e-3, 1e-10, 1e2)  # shares of the median information; more moves nothing
 _MOST_STEPS = 60  # steps of one descent; 20 to 40 are taken
 _LEAST_GAIN, _LEAST_GAIN_A_CAMERA = 0.5, 0.003  # nats; a smaller change of the bound is none
-_CHUNK = 8192  # directions; what they add to sums is added up in this order, whatever the threads
 _SMALL_STEP = 1e-3  # nats that a step promises; below, it is taken unseen, since rounding may hide the gain
 _MET = 0.1  # levels; a descent that has all baselines of another, so closely, ends where that did
 _MOST_ROUNDS = 4  # descents that follow the first, each from a consensus; most graphs want one
@@ -160,6 +160,7 @@ class _Residuals(NamedTuple):
 
     locations: FloatArray
     lengths: FloatArray  # (m,) floored
+    logs: FloatArray  # (m,) logs of these, less their mean
     units: FloatArray  # (m, d) directions of the baselines
     across: FloatArray  # (m, d, d - 1) axes of the covariances, less what of them is along the baselines
     errors: FloatArray  # (m, d - 1) along these axes, radians
@@ -207,7 +208,7 @@ class Mixture:
         self._peak = float(np.exp(log_sphere - 0.5 * (d - 1) * np.log(2.0 * np.pi)))
         self._factor = allocate_factor(plan, d, threads=threads)
         self._workers, m = Workers(threads), graph.num_edges
-        self._chunks = [slice(k, k + _CHUNK) for k in range(0, m, _CHUNK)]
+        self._chunks = [slice(k, k + SLICE) for k in range(0, m, SLICE)]
         self._least_gain = max(_LEAST_GAIN, _LEAST_GAIN_A_CAMERA * graph.num_nodes)
         self._descents: list[_Descent] = []
         self._lengths = LengthPrior(graph)
@@ -250,7 +251,7 @@ class Mixture:
         for _ in range(_WEIGH_ROUNDS):
             expected = at.errors**2 + variances
             levels = levels._replace(right=_right_share(self._expect(expected, levels, 0.0).sums))
-            noise = _Noise(levels, 0.0, self._own, variances, *self._precisions(at.lengths))
+            noise = _Noise(levels, 0.0, self._own, variances, *self._lengths.precisions(at.logs))
             system = self._equations(at, noise.precision, self._expect(expected, levels, 0.0))
             if not self._refactor(system, _DAMPING.least):
                 return -np.inf
@@ -268,12 +269,12 @@ class Mixture:
         variances, path = np.zeros_like(self._own), list[FloatArray]()
         for step in range(_MOST_STEPS):
             own = self._own + opened
-            levels, found = self._fit(at.errors**2 + variances, levels, floor, own)
+            levels, found, precisions = self._fit(at, variances, levels, floor, own)
             opening = float(np.sqrt(opened.max()))
             for other in others:
                 if opening <= _NOISELESS_RAD and self._meet(other, step, at, max(floor, levels.typical)):
                     return other
-            noise = _Noise(levels, floor, own, variances, *self._precisions(at.lengths))
+            noise = _Noise(levels, floor, own, variances, *precisions)
             system = self._equations(at, noise.precision, found)
             path.append(at.locations)
             moved, damping = self._step(at, noise, system, damping)
@@ -290,7 +291,7 @@ class Mixture:
     def _meet(self, other: _Descent, step: int, at: _Residuals, level: float) -> bool:
         """Return whether all baselines are as another descent had them after as many steps."""
         there = other.path[step] if step < len(other.path) else other.end.locations
-        apart = np.linalg.norm(differences(at.locations - there, self._graph.edges), axis=1)
+        apart = self._baselines(at.locations - there)[1]
         return bool(np.all(apart < _MET * level * at.lengths))
 
     def _draw_in(self, t: FloatArray) -> FloatArray:
@@ -298,9 +299,11 @@ class Mixture:
 
         Nothing determines such a node, and at the scale of the others the prior of lengths hardly moves it.
         """
-        edges, n = self._graph.edges, self._graph.num_nodes
-        lengths = np.linalg.norm(differences(t, edges), axis=1)
-        logs = np.log(np.maximum(lengths / max(float(np.median(lengths)), _TINY), _SHORTEST))
+        edges, n, lengths = self._graph.edges, self._graph.num_nodes, self._baselines(t)[1]
+        unit = max(float(np.median(lengths)), _TINY)
+        if lengths.max() <= _LONGEST * unit:
+            return t
+        logs = np.log(np.maximum(lengths / unit, _SHORTEST))
         degrees = self._graph.degrees()
         far = np.bincount(edges.ravel(), np.repeat(logs, 2), n) > np.log(_LONGEST) * degrees
         if not far.any():
@@ -336,32 +339,38 @@ class Mixture:
 
     def _residuals(self, t: FloatArray) -> _Residuals:
         """Return the errors of the directions at locations, which are centered and scaled."""
-        baselines, v = differences(t, self._graph.edges), self._graph.directions
-        lengths = np.linalg.norm(baselines, axis=1)
+        units, lengths = self._baselines(t)
         unit = max(float(np.median(lengths)), _TINY)
         scaled = np.asarray((t - t.mean(axis=0)) / unit)
         errors, across = np.empty_like(self._own), np.empty_like(self._axes)
-        found = _Residuals(scaled, np.empty_like(lengths), np.empty_like(v), across, errors)
+        found, v = (
+            _Residuals(scaled, lengths, np.empty_like(lengths), units, across, errors),
+            self._graph.directions,
+        )
 
         def job(of: slice) -> None:
-            floored = found.lengths[of] = np.maximum(lengths[of] / unit, _SHORTEST)
-            units = found.units[of] = baselines[of] / (unit * floored)[:, None]
-            angles = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(units - v[of], axis=1), 1.0))
-            along = np.einsum("edk,ed->ek", self._axes[of], units)
-            across[of] = self._axes[of] - units[:, :, None] * along[:, None, :]
-            sines = np.linalg.norm(along, axis=1)
-            # Scaled to the angle, beyond 90 degrees too; straight behind, any axis will do.
-            behind = sines <= _TINY
-            along[behind, 0], sines[behind] = 1.0, 1.0
-            errors[of] = along * (angles / sines)[:, None]
+            part = _Residuals(scaled, *(column[of] for column in found[1:]))
+            _measure_errors(unit, v[of], self._axes[of], part)
 
         self._workers.run([partial(job, of) for of in self._chunks])
+        found.logs[:] -= found.logs.mean()
         return found
 
+    def _baselines(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return measure_baselines(t, self._graph.edges)
+
     def _expect(
-        self, expected: FloatArray, levels: Levels, floor: float, own: FloatArray | None = None
+        self,
+        expected: FloatArray,
+        levels: Levels,
+        floor: float,
+        own: FloatArray | None = None,
+        beside: Sequence[Callable[[], object]] = (),
     ) -> _Expectation:
-        """Return what squared errors expected along the axes, (m, d - 1), say under some levels."""
+        """Return what squared errors expected along the axes, (m, d - 1), say under some levels.
+
+        Other jobs are done beside.
+        """
         information, likelihood = np.empty_like(expected), np.empty(len(expected))
         weights = np.r_[1.0 - levels.right, levels.right * self._peak * _NODE_SHARES]
         levels2, own = levels.at_nodes(floor) ** 2, self._own if own is None else own
@@ -376,20 +385,25 @@ class Mixture:
                 _Expectation(information[of], likelihood[of], sums[k]),
             )
 
-        self._workers.run([partial(job, k, of) for k, of in enumerate(self._chunks)])
+        self._workers.run([*beside, *(partial(job, k, of) for k, of in enumerate(self._chunks))])
         return _Expectation(information, likelihood, sums.sum(axis=0))
 
     def _fit(
-        self, expected: FloatArray, levels: Levels, floor: float, own: FloatArray
-    ) -> tuple[Levels, _Expectation]:
-        """Return the levels after rounds of expectation maximization, and what is expected under them."""
-        found = self._expect(expected, levels, floor, own)
+        self, at: _Residuals, variances: FloatArray, levels: Levels, floor: float, own: FloatArray
+    ) -> tuple[Levels, _Expectation, tuple[float, float]]:
+        """Return the levels after rounds of expectation maximization, and what is expected under them.
+
+        With them the precisions of the prior of lengths.
+        """
+        expected, precisions = at.errors**2 + variances, list[tuple[float, float]]()
+        beside = [lambda: precisions.append(self._lengths.precisions(at.logs))]
+        found = self._expect(expected, levels, floor, own, beside)
         for _ in range(_FIT_ROUNDS):
             last, levels = levels, _maximize(found, expected, levels, floor)
             found = self._expect(expected, levels, floor, own)
             if np.abs(np.subtract(levels, last)).max() <= _SETTLED:
                 break
-        return levels, found
+        return levels, found, precisions[0]
 
     def _judge(self, at: _Residuals, noise: _Noise, bound: float) -> MixtureEnd:
         """Return locations with the posterior that each direction is right, and its variance if it is."""
@@ -431,31 +445,26 @@ class Mixture:
         change = float(self._expect((1.0 + _PROBE) * expected, levels, 0.0).information.sum()) - total
         return float(np.clip(1.0 + 2.0 / expected.shape[1] * change / _PROBE / total, _LEAST_TOLD, 1.0))
 
-    def _precisions(self, lengths: FloatArray) -> tuple[float, float]:
-        unit = self._graph.num_nodes / len(lengths) / self._lengths.variance(lengths)
-        return unit / self._lengths.design_effect(lengths), unit
-
     def _cost(self, at: _Residuals, noise: _Noise) -> float:
         likelihood = self._expect(
             at.errors**2 + noise.variances, noise.levels, noise.floor, noise.own
         ).likelihood
-        return _prior_cost(at.lengths, noise.precision) - float(likelihood.sum())
+        return _prior_cost(at, noise.precision) - float(likelihood.sum())
 
     def _equations(self, at: _Residuals, precision: float, found: _Expectation) -> _System:
         m, d = at.units.shape
         blocks, gradient = np.empty((m, d, d)), np.empty((m, d))
-        excess = _excess_logs(at.lengths)
 
         def job(of: slice) -> None:
-            part = _Residuals(at.locations, at.lengths[of], at.units[of], at.across[of], at.errors[of])
-            _assemble(part, found.information[of], precision, excess[of], blocks[of], gradient[of])
+            part = _Residuals(at.locations, *(column[of] for column in at[1:]))
+            _assemble(part, found.information[of], precision, blocks[of], gradient[of])
 
         self._workers.run([partial(job, of) for of in self._chunks])
         return _System(
             blocks=blocks,
             gradient=gradient,
             damping_unit=float(np.median(found.information)) / at.lengths**2,
-            cost=_prior_cost(at.lengths, precision) - float(found.likelihood.sum()),
+            cost=_prior_cost(at, precision) - float(found.likelihood.sum()),
         )
 
     def _refactor(self, system: _System, damping: float) -> bool:
@@ -528,15 +537,35 @@ def _posterior(levels: Levels, likelihood: FloatArray) -> FloatArray:
     return np.asarray(-np.expm1(np.minimum(np.log1p(-levels.right) - likelihood, 0.0)))
 
 
-def _excess_logs(lengths: FloatArray) -> FloatArray:
-    """Return log lengths (m,) less their mean."""
-    logs = np.log(lengths)
-    return np.asarray(logs - logs.mean())
+def _prior_cost(at: _Residuals, precision: float) -> float:
+    """Return minus the log prior of lengths."""
+    return float(0.5 * precision * np.sum(at.logs**2))
 
 
-def _prior_cost(lengths: FloatArray, precision: float) -> float:
-    """Return minus the log prior of lengths (m,)."""
-    return float(0.5 * precision * np.sum(_excess_logs(lengths) ** 2))
+@kernel
+def _measure_errors(unit: float, v: Any, axes: Any, found: Any) -> None:
+    """Write lengths and their logs, units, axes across, and errors; `found` has lengths and baselines."""
+    _, lengths, logs, units, across, errors = found
+    d = v.shape[1]
+    for e in range(len(v)):
+        lengths[e] = max(lengths[e] / unit, _SHORTEST)
+        logs[e], chord2, sine2 = np.log(lengths[e]), 0.0, 0.0
+        for a in range(d):
+            units[e, a] /= unit * lengths[e]
+            chord2 += (units[e, a] - v[e, a]) ** 2
+        for q in range(d - 1):
+            along = 0.0
+            for a in range(d):
+                along += axes[e, a, q] * units[e, a]
+            for a in range(d):
+                across[e, a, q] = axes[e, a, q] - units[e, a] * along
+            errors[e, q] = along
+            sine2 += along * along
+        angle, sine = 2.0 * np.arcsin(min(0.5 * np.sqrt(chord2), 1.0)), np.sqrt(sine2)
+        if sine <= _TINY:  # straight behind, any axis will do
+            errors[e, 0], sine = 1.0, 1.0
+        for q in range(d - 1):  # scaled to the angle, beyond 90 degrees too
+            errors[e, q] *= angle / sine
 
 
 @kernel
@@ -583,13 +612,13 @@ def _expect(expected: Any, own: Any, levels2: Any, weights: Any, found: Any) -> 
 
 
 @kernel
-def _assemble(at: Any, information: Any, precision: float, excess: Any, blocks: Any, gradient: Any) -> None:
+def _assemble(at: Any, information: Any, precision: float, blocks: Any, gradient: Any) -> None:
     """Write what each direction adds to the normal matrix (m, d, d) and to the gradient (m, d)."""
     d = gradient.shape[1]
     for e in range(len(gradient)):
         scale, trace = 1.0 / at.lengths[e] ** 2, 0.0
         for a in range(d):
-            pull = precision * excess[e] * at.units[e, a]
+            pull = precision * at.logs[e] * at.units[e, a]
             for q in range(d - 1):
                 pull += information[e, q] * at.errors[e, q] * at.across[e, a, q]
             gradient[e, a] = pull / at.lengths[e]

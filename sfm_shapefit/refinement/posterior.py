@@ -37,11 +37,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.executors import in_ranges
+from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.executors import in_ranges, in_threads
 from sfm_shapefit.base.jit import inner_kernel, kernel, mix_bits
 from sfm_shapefit.base.scipy_parts import expit, gammaln, logit, xlogy
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.laplacian.operators import group_by
 
 _LEVELS_RAD = (0.2, 0.13, 0.085, 0.055, 0.036, 0.024, 0.016, 0.011, 0.0075, 0.005)
 """Noise levels of directions, descending by a factor of about 1.5; below the last all is exact."""
@@ -94,8 +95,8 @@ def weigh_by_triangles(graph: ViewGraph, threads: int = 1) -> TriangleEvidence:
     m, d = graph.num_edges, graph.dimension
     if len(sides) == 0:
         return TriangleEvidence(log_odds=np.zeros(m), prior=0.5, num_triangles=0)
-    shapes = _shapes(products)
-    norms = _normalizers(d)
+    shapes = _shapes(products, threads)
+    norms = _normalizers(d, threads)
     shares = _fit_shares(shapes, d, norms, threads)
     messages, log_odds = np.zeros((len(sides), 3)), np.zeros(m)
     prior = float(np.clip(np.cbrt(shares.sum()), *_PRIORS))
@@ -119,11 +120,11 @@ def weigh_by_triangles(graph: ViewGraph, threads: int = 1) -> TriangleEvidence:
 
 def _draw_triangles(graph: ViewGraph) -> tuple[IntArray, FloatArray]:
     """Return the edges of triangles (k, 3), and the dot products of their signed sides: ab, bc, ca."""
-    ends = np.concatenate([graph.edges.T.ravel(), graph.edges.T[::-1].ravel()]).reshape(2, -1)
-    order = np.lexsort(ends[::-1])
-    pointers = np.searchsorted(ends[0][order], np.arange(graph.num_nodes + 1))
-    neighbors, edge_of = ends[1][order], order % graph.num_edges
-    around, v = (pointers, neighbors, edge_of, graph.edges), graph.directions
+    ends, v = frozen(graph.edges.ravel()), graph.directions
+    _, ascending = group_by(ends, graph.num_nodes)
+    pointers, order = group_by(frozen(ends[ascending ^ 1]), graph.num_nodes)
+    entries = ascending[order]
+    around = (pointers, ends[entries], entries // 2, graph.edges)
     counts, no_sides, no_products = np.zeros(graph.num_edges), np.empty((0, 3), np.int64), np.empty((0, 3))
     everything = np.ones(graph.num_edges)
     _visit_triangles(around, v, everything, counts, no_sides, no_products)
@@ -135,18 +136,23 @@ def _draw_triangles(graph: ViewGraph) -> tuple[IntArray, FloatArray]:
     return sides, products
 
 
-def _shapes(products: FloatArray) -> _Shapes:
+def _shapes(products: FloatArray, threads: int) -> _Shapes:
     """Return the shapes of triangles of given dot products (k, 3) of their unit sides."""
-    ab, bc, ca = products.T
-    squares = products**2
-    angles = np.arctan2(np.sqrt(np.maximum(1.0 - squares, 0.0)), products)
-    total, widest = angles.sum(axis=1), angles.max(axis=1)
-    closes = 2.0 * np.pi - total <= total - 2.0 * widest
-    return _Shapes(
-        off_plane=np.sqrt(np.maximum(1.0 + 2.0 * ab * bc * ca - squares.sum(axis=1), 0.0)),
-        sines=np.sum(1.0 - squares, axis=1),
-        gap=np.where(closes, 0.0, np.pi - widest),
-    )
+    found = _Shapes(*np.empty((3, len(products))))
+
+    def fill(begin: int, end: int) -> None:
+        ab, bc, ca = columns = products[begin:end].T
+        squares = columns**2
+        angles = np.arctan2(np.sqrt(np.maximum(1.0 - squares, 0.0)), columns)
+        total, widest = angles.sum(axis=0), angles.max(axis=0)
+        closes = 2.0 * np.pi - total <= total - 2.0 * widest
+        off_plane2 = 1.0 + 2.0 * ab * bc * ca - squares.sum(axis=0)
+        found.off_plane[begin:end] = np.sqrt(np.maximum(off_plane2, 0.0))
+        found.sines[begin:end] = np.sum(1.0 - squares, axis=0)
+        found.gap[begin:end] = np.where(closes, 0.0, np.pi - widest)
+
+    in_ranges(threads, len(products), fill)
+    return found
 
 
 def _ratio(shapes: _Shapes, tau: float, dimension: int, threads: int = 1) -> FloatArray:
@@ -180,14 +186,18 @@ def _log_mean_power(more: int) -> float:
     return float(2.0 * (sines[0] - sines[1]) + sines[2] - sines[3])
 
 
-def _normalizers(dimension: int) -> FloatArray:
+def _normalizers(dimension: int, threads: int) -> FloatArray:
     """Return what makes the mean of rho over random triangles 1, for each rung."""
     drawn = min(dimension, _SPACE)
     sides = np.random.default_rng(0).standard_normal((3, _RANDOM_TRIANGLES, drawn))
     a, b, c = sides / np.linalg.norm(sides, axis=2, keepdims=True)
-    shapes = _shapes(np.stack([np.sum(x * y, axis=1) for x, y in ((a, b), (b, c), (c, a))], axis=1))
+    shapes = _shapes(np.stack([np.sum(x * y, axis=1) for x, y in ((a, b), (b, c), (c, a))], axis=1), threads)
     weights = xlogy(dimension - drawn, shapes.off_plane)
-    return np.array([1.0 / np.mean(_weighed_ratio(shapes, tau, dimension, weights)) for tau in _RUNGS_RAD])
+
+    def mean(tau: float) -> float:
+        return float(np.mean(_weighed_ratio(shapes, tau, dimension, weights)))
+
+    return 1.0 / np.array(list(in_threads(threads, mean, _RUNGS_RAD)))
 
 
 def _fit_shares(shapes: _Shapes, dimension: int, norms: FloatArray, threads: int) -> FloatArray:
@@ -201,7 +211,7 @@ def _fit_shares(shapes: _Shapes, dimension: int, norms: FloatArray, threads: int
     shares = np.full(len(ratios), 0.02)
     for _ in range(_FIT_ROUNDS):
         density = shares @ ratios + 1.0 - shares.sum()
-        shares = shares * np.mean(ratios / density, axis=1)
+        shares = shares * (ratios @ (1.0 / density)) / len(density)
     return np.asarray(shares)
 
 

@@ -94,7 +94,7 @@ def solve_reweighted(
         refine: refines locations in the angles of a graph's directions.
     """
     search = _Search(measured, options, refine)
-    mixture = fit_mixture(measured, usual)
+    mixture = fit_mixture(measured, usual, options.num_threads())
     found = search.climb(usual, mixture)
     few = _FEW if found is None or measured.graph.num_edges > PAIRS_AT_SCALE else _FEW_OF_MOVED
     if (mixture if found is None else found.mixture).shares[0] < few:
@@ -112,7 +112,7 @@ def solve_at_triangles(measured: MeasuredGraph, options: SolverOptions) -> Rewei
     triangles = weigh_by_triangles(graph, options.num_threads())
     weighted = graph.with_weights(graph.weights * np.maximum(triangles.posterior, _LEAST_WEIGHT))
     solved = solve(weighted, options, groups=measured.groups)
-    mixture = fit_mixture(measured, solved.locations)
+    mixture = fit_mixture(measured, solved.locations, options.num_threads())
     return Reweighted(graph=weighted, solved=solved, refined=None, mixture=mixture, triangles=triangles)
 
 
@@ -140,7 +140,7 @@ class _Search:
             moved = self._put(locations, mixture.log_odds, mixture.variances)
             if best is None and np.array_equal(moved, locations):
                 return None
-            there, least = fit_mixture(self._measured, moved), _more(mixture.evidence)
+            there, least = self._fit(moved), _more(mixture.evidence)
             if best is not None and there.evidence <= least:
                 break
             placed = self._place(there.posterior, moved)
@@ -166,7 +166,7 @@ class _Search:
             level, factor = float(np.clip(factor * residual, _LEAST_LEVEL_RAD, level)), _LEVEL
             odds, variances = np.full(graph.num_edges, logit(prior)), np.full(graph.num_edges, level**2)
             moved = self._put(placed, odds, variances, sweeps=1)
-            candidates += [(t, fit_mixture(self._measured, t)) for t in (placed, moved)]
+            candidates += [(t, self._fit(t)) for t in (placed, moved)]
             heard = np.clip(log_ratio(residual_angles(graph, moved), variances, graph.dimension), *_HEARD)
             new = expit(triangles.log_odds + odds + heard)
             prior = float(np.clip(np.mean(new), *_PRIORS))
@@ -182,6 +182,9 @@ class _Search:
         moved = put_by_consensus(self._measured.graph, t, odds, variances, **how)
         stays = groups is None or np.array_equal(moved, t)
         return moved if groups is None or stays else groups.expand(groups.fit(moved)[0])
+
+    def _fit(self, t: FloatArray) -> ResidualMixture:
+        return fit_mixture(self._measured, t, self._options.num_threads())
 
     def _solve(self, graph: ViewGraph) -> SolverResult:
         return solve(graph, self._options, groups=self._measured.groups)
@@ -200,8 +203,8 @@ class _Search:
         graph = self._weighted(posterior)
         solved = self._solve(graph)
         refined = self._refine(graph, solved.locations, near)
-        mixture = fit_mixture(self._measured, refined.locations)
-        unrefined = fit_mixture(self._measured, solved.locations)
+        mixture = self._fit(refined.locations)
+        unrefined = self._fit(solved.locations)
         if unrefined.evidence >= mixture.evidence:
             return Reweighted(graph=graph, solved=solved, refined=None, mixture=unrefined)
         return Reweighted(graph=graph, solved=solved, refined=refined, mixture=mixture)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, stable_order
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
 from sfm_shapefit.base.record import Record
@@ -269,7 +269,7 @@ def _find_best_fit(problem: _Problem, options: PlacementOptions) -> _Kept:
         candidates.pop()
     reweighted, refining = None, problem
     if is_iterative and options.objective == "auto":  # what the weights answer needs no other refinement
-        mixture = fit_mixture(measured, candidates[0][1])
+        mixture = fit_mixture(measured, candidates[0][1], problem.threads)
         reweighted = _reweight(problem, candidates[0][1], mixture, options)
         refining = problem if reweighted is None else problem._replace(normal_solver=None)
     starts: list[Start] = []
@@ -282,7 +282,7 @@ def _find_best_fit(problem: _Problem, options: PlacementOptions) -> _Kept:
     if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
     if reweighted is None:
-        mixture = fit_mixture(measured, chosen.best)
+        mixture = fit_mixture(measured, chosen.best, problem.threads)
         reweighted = _reweight(problem, chosen.best, mixture, options)
     if reweighted is not None:
         chosen, reason = _start_of(reweighted), _explain(mixture, reweighted)
@@ -421,7 +421,7 @@ def _by_posteriors(
     problem: _Problem, best: MixtureEnd, options: PlacementOptions
 ) -> tuple[Reweighted, FloatArray] | None:
     """Return the best ShapeFit at posteriors of residuals and triangles, in turn, and where it leads to."""
-    mixture = fit_mixture(problem.measured, best.locations)
+    mixture = fit_mixture(problem.measured, best.locations, problem.threads)
     found = _reweight(problem, best.locations, mixture, options)
     return None if found is None else (found, found.locations)
 
@@ -520,11 +520,9 @@ def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:
 def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
     """Return the median length of each camera's pairs, (n,), at least a millionth of the mean of all."""
     lengths = np.linalg.norm(differences(t, graph.edges), axis=1)
-    camera = graph.edges.T.ravel()
-    order = np.lexsort((np.tile(lengths, 2), camera))
-    degree = graph.degrees()
+    rank, degree = np.argsort(lengths), graph.degrees()
+    ranked = np.repeat(lengths[rank], 2)[stable_order(graph.edges[rank].ravel())]
     first = np.cumsum(degree) - degree
-    ranked = np.tile(lengths, 2)[order]
     low, high = ranked[first + (degree - 1) // 2], ranked[first + degree // 2]
     return np.asarray(np.maximum(0.5 * (low + high), _POINT_LENGTH * np.mean(lengths)))
 

@@ -315,9 +315,7 @@ def check_pairs(
     _refuse(outside, joined, f"must join two different images of 0..{n - 1}")
     measured = _numbers("rotations", rotations, (k, 3, 3))
     defect = np.abs(measured @ measured.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    _refuse(
-        (defect > _ROTATION_TOLERANCE) | (np.linalg.det(measured) < 0.0), joined, "has no rotation matrix"
-    )
+    _refuse((defect > _ROTATION_TOLERANCE) | (_minors(measured)[2] < 0.0), joined, "has no rotation matrix")
     supports = np.ones(k) if weights is None else _numbers("weights", weights, (k,))
     _refuse(supports <= 0.0, joined, "has a weight that is not positive")
     known = np.tile(np.eye(3) / np.radians(1.0) ** 2, (k, 1, 1))
@@ -325,8 +323,7 @@ def check_pairs(
         known = _numbers("information", information, (k, 3, 3))
         size = np.abs(known).max(axis=(1, 2), initial=0.0)
         skew = np.abs(known - known.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
-        minors = [np.linalg.det(known[:, :order, :order]) for order in (1, 2, 3)]
-        definite = (np.min(minors, axis=0) > 0.0) & (skew <= _ROTATION_TOLERANCE * size)
+        definite = (np.min(_minors(known), axis=0) > 0.0) & (skew <= _ROTATION_TOLERANCE * size)
         _refuse(~definite, joined, "has information that is not symmetric and positive definite")
     ends = np.sort(joined, axis=1)
     order = np.lexsort(ends.T[::-1])
@@ -356,6 +353,13 @@ def _numbers(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> FloatA
     if not np.isfinite(array).all():
         raise InputError(f"{name} must be finite numbers")
     return array
+
+
+def _minors(matrices: FloatArray) -> FloatArray:
+    """Return the leading minors of orders 1, 2, 3 of matrices (k, 3, 3), (3, k)."""
+    a, b, c = matrices.transpose(1, 2, 0)
+    crossed = np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return np.stack([a[0], crossed[2], np.sum(crossed * c, axis=0)])
 
 
 def _refuse(bad: BoolArray, pairs: IntArray, reason: str) -> None:

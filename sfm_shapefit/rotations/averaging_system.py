@@ -15,7 +15,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.executors import in_threads
+from sfm_shapefit.base.executors import in_slices
 from sfm_shapefit.laplacian.approximate import (
     JacobiPreconditioner,
     Preconditioner,
@@ -67,10 +67,7 @@ class AveragingSystem:
 
     def over_pairs(self, work: Callable[..., object], *given: object) -> None:
         """Call `work(begin, end, *given)` for slices of the pairs, each of which it fills, in threads."""
-        count = len(self.pairs)
-        cuts = [(begin, min(begin + _SLICE, count)) for begin in range(0, count, _SLICE)]
-        for _ in in_threads(min(self.threads, len(cuts)), lambda cut: work(*cut, *given), cuts):
-            pass
+        in_slices(self.threads, len(self.pairs), _SLICE, work, *given)
 
     def gradient_of(self, pulls: FloatArray) -> FloatArray:
         """Return D^T of what pulls at the pairs, (k, 3), at their cameras, (n, 3)."""

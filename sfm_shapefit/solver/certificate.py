@@ -114,7 +114,6 @@ class Certificate:
         return self.objective - self.dual_bound
 
 
-@one_blas_thread()  # more would round the sums over all cameras differently
 def certify(
     graph: ViewGraph,
     locations: FloatArray,
@@ -139,35 +138,47 @@ def certify(
             are not those of the groups.
         UnsolvableError: if the dual must be repaired and the graph or its groups are not connected.
     """
+    return certify_as_asked(graph, locations, dual, groups, Asked(tol, uniqueness))
+
+
+class Asked(NamedTuple):
+    """What a certificate is to say; see `certify`."""
+
+    tol: float
+    uniqueness: bool
+    threads: int = 1
+    """They share the work; the certificate does not depend on them."""
+
+
+@one_blas_thread()  # more would round the sums over all cameras differently
+def certify_as_asked(
+    graph: ViewGraph, locations: FloatArray, dual: FloatArray, groups: RigidGroups | None, asked: Asked
+) -> Certificate:
+    """Return what `certify` does, by several threads."""
     _refuse_arrays(graph, locations, dual)
     y = np.array(dual, dtype=np.float64, order="C")
     if groups is None:
-        return _certify(graph, locations, y, None, tol, uniqueness=uniqueness)
+        return _certify(graph, locations, y, None, asked)
     outer = groups.joins(graph.edges)
     _refuse_groups(groups, locations, outer)
     between, every = graph.subset(outer), np.zeros_like(y)
     reduction = Reduction.over(between.edges, groups.normalize())
-    found = _certify(between, locations, y[outer], reduction, tol, uniqueness=uniqueness)
+    found = _certify(between, locations, y[outer], reduction, asked)
     every[outer] = found.dual
     return replace(found, dual=frozen(every))
 
 
 def _certify(
-    graph: ViewGraph,
-    locations: FloatArray,
-    y: FloatArray,
-    reduction: Reduction | None,
-    tol: float,
-    *,
-    uniqueness: bool,
+    graph: ViewGraph, locations: FloatArray, y: FloatArray, reduction: Reduction | None, asked: Asked
 ) -> Certificate:
     """Return the certificate of y, made feasible in place, for locations of nodes, or of a reduction."""
-    found = certify_in_place(graph, locations, y, tol, np.inf, Resources(factor=reduction))
+    resources = Resources(asked.threads, factor=reduction)
+    found = certify_in_place(graph, locations, y, asked.tol, np.inf, resources)
     assert found is not None, "no gap is above infinity"
-    if not uniqueness:
+    if not asked.uniqueness:
         return found
     t = locations - locations.mean(axis=0)
-    return replace(found, unique=_is_unique(graph, t, found.dual, reduction))
+    return replace(found, unique=_is_unique(graph, t, found.dual, resources))
 
 
 def _refuse_arrays(graph: ViewGraph, locations: FloatArray, dual: FloatArray) -> None:
@@ -518,8 +529,9 @@ def _move(metric: Any, h: Any) -> float:
     return worst
 
 
-def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray, reduction: Reduction | None) -> bool | None:
+def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray, resources: Resources) -> bool | None:
     """Return whether the feasible dual excludes other optima; None if the factor would be too large."""
+    reduction = resources.factor if isinstance(resources.factor, Reduction) else None
     if graph.num_edges > _UNIQUENESS_EDGES:
         return None
     n, d, v = graph.num_nodes, graph.dimension, graph.directions
@@ -537,7 +549,7 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray, reduction: Reduct
         return _is_regular_dense(graph, blocks)
     if reduction is None:
         plan = analyze(n, graph.edges, graph.elimination_tree())
-        reduction = Reduction(allocate_factor(plan, d))
+        reduction = Reduction(allocate_factor(plan, d, threads=resources.threads))
     try:
         reduction.refactor(blocks)
     except UnsolvableError:

@@ -23,15 +23,25 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.executors import in_slices
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
+
+SLICE = 8192
+"""Edges that one thread takes at a time; sums are those of slices, whatever the number of threads."""
 
 
 def differences(t: FloatArray, edges: IntArray) -> FloatArray:
     """Return D T, the baselines t_i - t_j, shape (m, d)."""
-    baselines = np.empty((len(edges), t.shape[1]))
-    _differences(frozen(t), frozen(edges), baselines)  # arrays that can be written cost another compilation
-    return baselines
+    return measure_baselines(t, edges)[0]
+
+
+def measure_baselines(t: FloatArray, edges: IntArray, threads: int = 1) -> tuple[FloatArray, FloatArray]:
+    """Return the baselines t_i - t_j, shape (m, d), and their lengths, (m,); threads share the edges."""
+    out = np.empty((len(edges), t.shape[1])), np.empty(len(edges))
+    # Arrays that can be written cost another compilation.
+    in_slices(threads, len(edges), SLICE, _measure_baselines, frozen(t), frozen(edges), *out)
+    return out
 
 
 def adjoint(y: FloatArray, edges: IntArray, num_nodes: int) -> FloatArray:
@@ -83,10 +93,13 @@ def normalize_locations(graph: ViewGraph, t: FloatArray) -> FloatArray:
 
 
 @kernel
-def _differences(t: Any, edges: Any, out: Any) -> None:
-    for e in range(len(edges)):
+def _measure_baselines(begin: int, end: int, t: Any, edges: Any, baselines: Any, lengths: Any) -> None:
+    for e in range(begin, end):
+        square = 0.0
         for k in range(t.shape[1]):
-            out[e, k] = t[edges[e, 0], k] - t[edges[e, 1], k]
+            baselines[e, k] = t[edges[e, 0], k] - t[edges[e, 1], k]
+            square += baselines[e, k] ** 2
+        lengths[e] = np.sqrt(square)
 
 
 @kernel

@@ -17,7 +17,7 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.factor import FactorPlan, analyze
-from sfm_shapefit.solver.certificate import Certificate, certify
+from sfm_shapefit.solver.certificate import Asked, Certificate, certify_as_asked
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton.dense import solve_newton_dense
 from sfm_shapefit.solver.newton.sparse import allocate_newton, solve_newton_reduced, solve_newton_sparse
@@ -121,9 +121,8 @@ def solve(
     run = SolverRun(*choice.solve(between, options.tol, limit, watch if on_iteration else None))
     locations = normalize_locations(between, run.locations)
     if certified:
-        certificate = certify(
-            between, locations, run.dual, groups=groups, tol=options.tol, uniqueness=options.uniqueness
-        )
+        asked = Asked(options.tol, options.uniqueness, options.num_threads())
+        certificate = certify_as_asked(between, locations, run.dual, groups, asked)
     else:  # nothing but what always holds
         value, none = objective(between, locations), np.zeros_like(run.dual)
         certificate = Certificate(objective=value, dual_bound=0.0, dual=none, equality_residual=0.0)

@@ -21,6 +21,7 @@ from sfm_shapefit.refinement.angular import (
     robust_cost,
 )
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
+from sfm_shapefit.refinement.consensus import fit_mixture, residual_angles
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.splitting.linear import laplacian_factor
 from tests.problems import CountedFactor, fit_angles, shape, shape_error
@@ -198,13 +199,39 @@ def test_the_metric_is_the_inverse_of_covariance_and_level():
     a = np.random.default_rng(0).standard_normal((graph.num_edges, 2, 2))
     covariance = a @ a.transpose(0, 2, 1)
     information = information_at(MeasuredGraph(graph, covariance=covariance), np.array([0.3]))
-    bases = angular.tangent_bases(graph.directions)
+    bases = tangent_bases(graph.directions)
     inside = bases.transpose(0, 2, 1) @ information @ bases
     np.testing.assert_allclose(
         inside @ (covariance + 0.09 * np.eye(2)), np.tile(np.eye(2), (10, 1, 1)), atol=1e-9
     )
     along = np.einsum("ea,eab,eb->e", graph.directions, information, graph.directions)
     np.testing.assert_allclose(along, np.trace(inside, axis1=1, axis2=2) / 2.0)
+
+
+def test_threads_that_share_the_pairs_change_no_bit():
+    """The graph has more pairs than two slices."""
+    problem = synthetic.random_graph_problem(190, 1.0, sigma=0.01, q=0.2, seed=2)
+    graph = problem.view_graph
+    measured, plan = MeasuredGraph(graph, covariance=isotropic(0.01, graph)), plan_refinement(graph)
+    found = [refine_angles(measured, problem.locations, plan, threads=threads) for threads in (1, 2, 7)]
+    fitted = [fit_mixture(measured, problem.locations, threads) for threads in (1, 2, 7)]
+    for threads in (1, 2):
+        np.testing.assert_array_equal(found[threads].locations, found[0].locations)
+        np.testing.assert_array_equal(fitted[threads].posterior, fitted[0].posterior)
+
+
+def test_shares_and_levels_of_a_mixture_are_those_of_its_own_posteriors():
+    """They are so where expectation maximization ends, as closely as it ends; pairs have own variances."""
+    problem = synthetic.random_graph_problem(60, 0.6, sigma=0.02, q=0.3, seed=4)
+    graph = problem.view_graph
+    own = np.random.default_rng(0).uniform(0.5, 1.0, graph.num_edges) * 0.01**2
+    mixture = fit_mixture(MeasuredGraph(graph, covariance=own[:, None, None] * np.eye(2)), problem.locations)
+    right, squares = mixture.posterior, residual_angles(graph, problem.locations) ** 2
+    assert mixture.shares[0] == pytest.approx(right.mean(), rel=1e-3)
+    assert mixture.shares[0] == pytest.approx(1.0 - problem.corrupted.mean(), abs=0.03)
+    wanted = np.sum(right * squares / 2.0 / mixture.variances**2)
+    assert wanted == pytest.approx(np.sum(right / mixture.variances), rel=1e-3)
+    np.testing.assert_allclose(mixture.variances - own, mixture.variances[0] - own[0], rtol=1e-9)
 
 
 def test_each_class_finds_its_own_level_and_keeps_it_while_it_is_not_fitted():
