@@ -1,6 +1,7 @@
 """Rows of numbers in a temporary file: what is read from end to end, and would take the most memory."""
 
 import tempfile
+import weakref
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,17 @@ from sfm_shapefit.base.errors import InputError
 class RowFile:
     """Rows (m, ...) of one type of number that are written in their order, read by slices, and written over.
 
-    The file has no name, and goes with the object.
+    The file goes with the object.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
         """Begin without a row; `shape` is that of an array with room for all, as of `numpy.empty`."""
         self.dtype, self._shape, self._length = np.dtype(dtype), shape[1:], 0
-        self._file = tempfile.TemporaryFile(prefix="shapefit-")  # noqa: SIM115  closed with the object
+        try:
+            self._file = tempfile.TemporaryFile(buffering=0, prefix="shapefit-")  # noqa: SIM115  closed below
+        except OSError as error:
+            raise InputError(f"no folder for temporary files can be written ({error}); set TMPDIR") from error
+        weakref.finalize(self, self._file.close)
         self._row_bytes = self.dtype.itemsize * int(np.prod(self._shape))
 
     def __len__(self) -> int:
@@ -31,7 +36,9 @@ class RowFile:
         first, end, _ = rows.indices(self._length)
         found = np.empty((max(end - first, 0), *self._shape), self.dtype)
         self._file.seek(first * self._row_bytes)
-        self._file.readinto(found.data)
+        room = found.data.cast("B") if len(found) else memoryview(b"")
+        while len(room):  # a system call may read less, and write less
+            room = room[self._file.readinto(room) :]
         return found
 
     def __setitem__(self, rows: slice, values: AnyArray) -> None:
@@ -42,8 +49,9 @@ class RowFile:
         """
         try:
             self._file.seek(rows.start * self._row_bytes)
-            self._file.write(np.ascontiguousarray(values, dtype=self.dtype).data)
-            self._file.flush()
+            left = np.ascontiguousarray(values, dtype=self.dtype).tobytes()
+            while left:
+                left = left[self._file.write(left) :]
         except OSError as error:
             raise InputError(
                 f"{tempfile.gettempdir()} has no room for {self._row_bytes * rows.stop / 1e6:.0f} MB of "
