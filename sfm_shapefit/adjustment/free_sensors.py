@@ -16,10 +16,18 @@ from sfm_shapefit.scene.images import Images
 # that of a focal length (`scene.lens`).
 _SHARED_NOISE = 7.0
 _LARGEST_TURN_RAD = math.radians(1.0)  # rad; a sensor less sure of its rotation counts as left open
-_OPEN_SENSOR = (
-    "the matches do not tell where {camera} is in its rig: its images see too little that others see too, or "
-    "the rig never turns; leave out rigs=free, or give more frames"
-)
+
+
+class OpenSensorError(InputError):
+    """The observations leave open where a sensor is in its rig."""
+
+    def __init__(self, camera: str) -> None:
+        """Keep the reason, a clause, without what to do."""
+        self.reason = (
+            f"the matches do not tell where {camera} is in its rig: its images see too little that others "
+            "see too, or the rig never turns"
+        )
+        super().__init__(f"{self.reason}; leave out rigs=free, or give more frames")
 
 
 def judge_sensors(
@@ -38,7 +46,7 @@ def judge_sensors(
         rotation about one, rad; NaN for sensors that are held.
 
     Raises:
-        InputError: if the observations leave the pose of a sensor open.
+        OpenSensorError: if the observations leave the pose of a sensor open.
     """
     found = np.full((len(free), 2), np.nan)
     if not free.any():
@@ -46,12 +54,12 @@ def judge_sensors(
     try:
         sigmas = estimate_covariances(adjusted, options).sensor_sigmas
     except UnsolvableError as error:
-        raise InputError(_OPEN_SENSOR.format(camera="one of the sensors")) from error
+        raise OpenSensorError("one of the sensors") from error
     longest = float(np.linalg.norm(adjusted.rig.translations, axis=1).max()) or 1.0  # all held at one center
     limits = np.repeat([METRIC_SIGMA * longest, _LARGEST_TURN_RAD], 3) / _SHARED_NOISE
     off = np.nan_to_num((sigmas / limits).max(axis=1), nan=np.inf)
     if off.max() > 1.0:
         worst = images.lenses[np.flatnonzero(free)[np.argmax(off)]]
-        raise InputError(_OPEN_SENSOR.format(camera=f"camera {worst.id}"))
+        raise OpenSensorError(f"camera {worst.id}")
     found[free] = np.column_stack([sigmas[:, :3].max(axis=1), sigmas[:, 3:].max(axis=1)])
     return found

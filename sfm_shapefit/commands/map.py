@@ -23,7 +23,7 @@ from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import MapContext, read_beside, start_run
 from sfm_shapefit.pipeline.execution import workers_of
-from sfm_shapefit.pipeline.mapping import join_mapped, locate_components, refine_intrinsics
+from sfm_shapefit.pipeline.mapping import follow_turns, join_mapped, locate_components, refine_intrinsics
 from sfm_shapefit.rotations.sequences import Loop, Videos
 from sfm_shapefit.scene.lens import FOCAL
 
@@ -133,7 +133,7 @@ def measure_run(run: MapContext) -> tuple[MapContext, RelativeRotations, Videos,
         if known.differ_in_rays(run.images):
             run = run._replace(images=known)
             relative = run.measure()
-    videos = run.find_videos(relative)
+    run, videos = follow_turns(run, relative), run.find_videos(relative)
     run, relative, loops = run.judge_loops(videos, relative)
     return run.score_pairs(relative), relative, videos, loops
 

@@ -45,7 +45,7 @@ from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import Shares, judge_model, too_few_to_judge, weigh_evidence
 from sfm_shapefit.judgement.judged import Judged
-from sfm_shapefit.judgement.limits import LOCAL_SHARE, SIGMAS
+from sfm_shapefit.judgement.limits import LOCAL_SHARE
 from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason, of_each, of_model
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.support import Support
@@ -60,7 +60,6 @@ from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.sequences import Loop
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import PARTS, Origin
 from sfm_shapefit.scene.matches import PairNames
 from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.solver.solver_options import SolverResult
@@ -325,7 +324,7 @@ class LocateResult(_Placed):
         repeats = tuple(match_warnings(self.directions, may_repeat=self.database is not None))[:1]
         repeated = (of_model(Kind.REPEATED, sentence) for sentence in repeats)
         lacks = () if self.model.num_points3D() else (of_model(Kind.POINTS, NO_POINTS),)
-        after = (*repeated, *self._off_priors(), *self._off_lenses(), *lacks, *self.suspicions)
+        after = (*repeated, *self._off_priors(), *lacks, *self.suspicions)
         return judge_model(self.placement, shares, before, after).led_by(self.recognized)
 
     def _off_priors(self) -> Iterator[Reason]:
@@ -335,16 +334,6 @@ class LocateResult(_Placed):
             if wrong > max(1, LOCAL_SHARE * count):
                 clause = f"{wrong} of {counted(count, 'position prior')} contradict where cameras stand"
                 yield of_model(Kind.INPUT, clause)
-
-    def _off_lenses(self) -> Iterator[Reason]:
-        """Yield focal lengths that were known, and changed by more than 3 sigma of those of EXIF data."""
-        most = SIGMAS * PARTS["focal_lengths"].sigmas[Origin.EXIF]
-        for row in self.intrinsics.rows(self.placed):
-            if row.origin == Origin.CALIBRATION.value and abs(row.change) > most:
-                clause = f"{row.statement}, too far for one that was known"
-                clause = f"{clause}: is its distortion missing, or a pose wrong?"
-                taken = self.placed.is_posed & (self.placed.camera_ids == row.camera)
-                yield of_model(Kind.LENS, clause, images=self.placed.names_of(np.flatnonzero(taken)))
 
     @property
     def database(self) -> Path | None:

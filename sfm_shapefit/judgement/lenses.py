@@ -23,7 +23,7 @@ of a zoom make few values that return, each known well beside its distance to th
 so in 2 % of the cases for ten images, less often for other numbers.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -32,9 +32,17 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, distinct, quantile
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.base.lists import RowLists
 from sfm_shapefit.judgement.evidence import OddImages
-from sfm_shapefit.judgement.limits import FITTING_PX, LOCAL_SHARE, RIVAL_SHARE, SMALLEST_SHAPE, SURE_SIGMAS
+from sfm_shapefit.judgement.limits import (
+    FITTING_PX,
+    LOCAL_SHARE,
+    RIVAL_SHARE,
+    SIGMAS,
+    SMALLEST_SHAPE,
+    SURE_SIGMAS,
+)
 from sfm_shapefit.judgement.reasons import Kind
-from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import PARTS, Lens, Origin
 from sfm_shapefit.scene.sequences import find_sequences
 from sfm_shapefit.scene.structure import Structure
 
@@ -170,6 +178,23 @@ def find_odd_lenses(structure: Structure, bogus: BoolArray) -> Iterator[OddImage
                 sentence = f"{sentence}, where {usual:.3g} is usual"
                 if far.any():
                     yield OddImages.of_values(Kind.LENS, images.names_of(cameras[far]), own[far], sentence)
+
+
+def find_changed_lenses(images: Images, known_px: Mapping[int, float]) -> Iterator[OddImages]:
+    """Yield the posed images whose focal lengths were known, and changed by more than 3 sigma of EXIF data.
+
+    Known ones are in pixels, by the rows of their lenses.
+    """
+    factors = np.array([lens.focal_px / known_px.get(k, np.nan) for k, lens in enumerate(images.lenses)])
+    most = SIGMAS * PARTS["focal_lengths"].sigmas[Origin.EXIF]
+    cameras = np.flatnonzero(images.is_posed & (np.abs(factors - 1.0) > most)[images.lens_of])
+    if len(cameras):
+        sentence = (
+            "a focal length {} times the one that was known, too far from it: is its distortion missing, or "
+            "is a pose wrong?"
+        )
+        own = factors[images.lens_of[cameras]]
+        yield OddImages.of_values(Kind.LENS, images.names_of(cameras), own, sentence)
 
 
 def _return_to_few(logs: FloatArray) -> bool:

@@ -104,6 +104,8 @@ class MapContext(NamedTuple):
     """Pairs that are taken for unmatched."""
     scores: PairScores = PairScores()
     """Scores of pairs of images."""
+    suspicions: tuple[str, ...] = ()
+    """Why the models are to be looked at, whatever their pairs say, a clause each."""
     memory_plan: MemoryPlan = MEMORY_PLANS[0]
     """What is given up for memory where the matches of all images are read."""
 

@@ -12,13 +12,15 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.base.geometry import fit_similarity
+from sfm_shapefit.files.colmap.database import DatabaseMatches
+from sfm_shapefit.files.colmap.intrinsics import calibrated_focals
 from sfm_shapefit.files.colmap.lenses import is_bogus
 from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
 from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape
 from sfm_shapefit.judgement.flights import find_flights
 from sfm_shapefit.judgement.lens_residuals import find_bent_lenses, lens_fields
-from sfm_shapefit.judgement.lenses import find_odd_lenses
+from sfm_shapefit.judgement.lenses import find_changed_lenses, find_odd_lenses
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, SMALLEST_SHAPE
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
 from sfm_shapefit.judgement.resolutions import find_outside
@@ -32,6 +34,7 @@ from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Origin
 from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.links import ObservedTracks
 
@@ -98,7 +101,7 @@ def question(state: ModelState, clock: Clock) -> ModelEvidence:
     source = replace(source, tied=_tied_by_priors(state, images))
     found, gauge = gather_evidence(source, fits, structure, clock.threads), state.gauge
     places = (one.moved(gauge.similarity.scale, gauge.axes) for one in found.places)
-    return replace(found, places=tuple(places))
+    return with_known_lenses(replace(found, places=tuple(places)), source, state.images)
 
 
 def confirm_by_pixels(state: ModelState) -> BoolArray:
@@ -114,6 +117,14 @@ def confirm_by_pixels(state: ModelState) -> BoolArray:
     pictures = ModelKeypoints(images, source.view.keypoints, source.view.num_keypoints)
     names = images.names_of(np.flatnonzero(doubted))
     return images.are_named(ask_pixels(source, Structure(state.points, images, pictures), names))
+
+
+def with_known_lenses(evidence: ModelEvidence, source: MatchSource, images: Images) -> ModelEvidence:
+    """Return the evidence with focal lengths that are far from those given, or known to a database."""
+    matches, lenses = source.matches, enumerate(images.lenses)
+    known_px = calibrated_focals(matches.file, images) if isinstance(matches, DatabaseMatches) else {}
+    known_px |= {k: one.as_given().focal_px for k, one in lenses if one.origin is Origin.CALIBRATION}
+    return replace(evidence, odd=(*evidence.odd, *find_changed_lenses(images, known_px)))
 
 
 def with_left_out(state: ModelState) -> Images:

@@ -18,6 +18,7 @@ from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
+from sfm_shapefit.judgement.rig_offsets import turn_sensors
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import MapContext
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, see_matches
@@ -56,6 +57,17 @@ def refine_intrinsics(run: MapContext, relative: RelativeRotations) -> Images:
             images = images.with_lenses_of(first.images, first.is_tried & ~is_known[rows])
             is_known[rows] |= first.is_tried
     return images
+
+
+def follow_turns(run: MapContext, relative: RelativeRotations) -> MapContext:
+    """Return the run with sensors turned in their rigs, and free, where matches inside frames say so."""
+    images, told = turn_sensors(run.images, relative)
+    if not told:
+        return run
+    freedom = run.options.freedom
+    if freedom.adjusts_cameras(images.num_images):
+        freedom = replace(freedom, rigs="free")
+    return run._replace(images=images, options=replace(run.options, freedom=freedom), suspicions=(told,))
 
 
 def _place_first(inputs: RunInputs, source: MatchSource, clock: Clock) -> Estimate:
@@ -120,7 +132,7 @@ def _locate_component(
     return replace(
         result,
         scores=run.scores.of(members[result.directions.pairs]),
-        suspicions=(*result.suspicions, *_suspicions(averaging)),
+        suspicions=(*result.suspicions, *_suspicions(run, averaging)),
     )
 
 
@@ -149,8 +161,9 @@ def _false_pairs(images: Images, among: RelativeRotations, averaging: AveragedRo
     return frozenset((min(pair), max(pair)) for pair in names)
 
 
-def _suspicions(averaging: AveragedRotations) -> Iterator[Reason]:
+def _suspicions(run: MapContext, averaging: AveragedRotations) -> Iterator[Reason]:
     """Yield why a model is to be looked at, whatever its pairs say: they say the same of a folded scene."""
+    yield from (of_model(Kind.INPUT, clause) for clause in run.suspicions)
     if averaging.num_repeated:
         clause = "the scene repeats itself, and pairs that would fold it were not followed"
         yield of_model(Kind.REPEATED, clause)

@@ -22,7 +22,6 @@ import numpy as np
 
 from sfm_shapefit import __version__
 from sfm_shapefit.adjustment.sources import collect_tracks
-from sfm_shapefit.base.arrays import distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.check_result import CheckResult, OtherModel, checked_camera_rows, checked_pair_rows
@@ -41,7 +40,7 @@ from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.bundle import points_of_pictures
 from sfm_shapefit.pipeline.conventions import ask_convention
-from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence
+from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence, with_known_lenses
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
@@ -117,6 +116,7 @@ def gather_evidence_against(state: CheckState, clock: Clock) -> CheckState:
     """Gather the evidence as `locate` does, with the open shape where nothing else has measured lenses."""
     source, structure = state.source, state.structure
     evidence = gather_evidence(source, state.fits, structure, clock.threads)
+    evidence = with_known_lenses(evidence, source, state.images)
     if source.inputs.is_made or not source.has_database:
         tracks = collect_tracks(state.images, structure.pictures, structure.points)
         rows = np.arange(state.images.num_images)
@@ -201,7 +201,7 @@ def finish_check(state: CheckState, clock: Clock) -> CheckResult:
         loose_groups=[],
         versions={"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
         mean_reprojection_error_px=float(errors_px.mean()) if len(errors_px) else np.nan,
-        num_lenses=len(distinct(state.images.lens_of)),
+        num_lenses=len(np.unique(state.images.lens_of)),
         median_track_length=_median(quality.point_track_lengths.tolist()),
         residual_level_deg=np.nan if fits is None else fits.level_deg,
         timings_s=clock.seconds,

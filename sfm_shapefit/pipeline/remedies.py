@@ -2,7 +2,8 @@
 
 A lens that is wrong is freed, a camera goes where most pairs put it, and the new model counts only if less
 speaks against it. The side of a seam is never guessed: nothing says which of two groups is wrong. Sensors
-whose offsets in their rigs are too short to tell the scale are taken to share one center.
+whose offsets in their rigs are contradicted go where matches inside frames put them; where offsets are too
+short to tell the scale, the sensors are taken to share one center.
 """
 
 from collections.abc import Iterator
@@ -11,19 +12,24 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.free_sensors import OpenSensorError
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.limits import OUTNUMBERED
-from sfm_shapefit.judgement.rig_offsets import find_contradicted_rigs
+from sfm_shapefit.judgement.reasons import Kind, of_model
+from sfm_shapefit.judgement.rig_offsets import find_contradicted_rigs, measured_offsets
 from sfm_shapefit.judgement.wrong_lenses import is_like_others
 from sfm_shapefit.pipeline.conventions import ask_resolution
 from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
+from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.pipeline.placing import measure_hold
 from sfm_shapefit.pipeline.stages import run_stages
 from sfm_shapefit.pipeline.starts import begin_model
 from sfm_shapefit.placement.gauge import UselessPriorsError
 from sfm_shapefit.placement.place import ContradictedOffsetsError
+from sfm_shapefit.scene.freedom import RigFreedom
 from sfm_shapefit.scene.lens import FOCAL, Origin
 
 _OPEN_SCALE = 0.5  # relative standard deviation; with a larger one the offsets may as well be 0
@@ -71,13 +77,8 @@ def make_model(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateRe
         UnsolvableError: if no camera can be placed.
     """
     result, notes = _run_in_scale(inputs, source, clock), tuple[str, ...]()
-    if isinstance(result, str):
-        given, why = inputs.images.sensors, result
-        inputs, source = at_one_center(inputs, source)
-        result = _run(inputs, source, clock)
-        images = result.images.with_sensors(given.rotations, given.translations)
-        wrong = (one.statement for one in find_contradicted_rigs(images, result.directions))
-        notes = (f"{next(wrong, why)}, so the sensors of a rig are taken to share one center",)
+    if not isinstance(result, LocateResult) or _contradicts_rigs(result, inputs):
+        inputs, source, result, notes = _run_with_other_offsets(result, inputs, source, clock)
     for remedy in find_remedies(result, inputs, source):
         again = _run(remedy.inputs, remedy.source, clock)
         if remedy.is_better(again, result):
@@ -100,35 +101,101 @@ def _run(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateResult:
             return run_stages(replace(state, inputs=replace(inputs, known=known)), clock.anew())
 
 
-def _run_in_scale(inputs: RunInputs, source: MatchSource, clock: Clock) -> LocateResult | str:
-    """Return what the stages make of a source, or why its scale is not that of the rigs, a sentence.
+def _run_in_scale(
+    inputs: RunInputs, source: MatchSource, clock: Clock
+) -> LocateResult | ContradictedOffsetsError | OpenSensorError:
+    """Return what the stages make of a source, or why its sensors are not where the rigs have them.
 
-    UnsolvableError: as `make_model`; that directions contradict offsets means nothing where these are short.
+    UnsolvableError: as `make_model`.
     """
-    longest = float(np.linalg.norm(inputs.images.sensors.translations, axis=1).max(initial=0.0))
     try:
         result = _run(inputs, source, clock)
-        sigma = result.placement.scale_sigma
-    except ContradictedOffsetsError as error:
-        sigma = measure_hold(error.placement).scale_sigma
-        is_short = error.length > -_SHORT or sigma > _OPEN_SCALE
-        if not (longest > 0.0 and is_short):
-            raise
-        sigma = np.inf
+    except (ContradictedOffsetsError, OpenSensorError) as error:
+        return error
+    longest, sigma = _longest_offset(inputs), result.placement.scale_sigma
     if longest > 0.0 and sigma is not None and sigma > _OPEN_SCALE:
-        return (
-            f"the offsets of sensors in their rigs, at most {longest:.2g}, are too short for this scene to "
-            "tell its scale"
-        )
+        return ContradictedOffsetsError(0.0, result.placement)
     return result
+
+
+def _longest_offset(inputs: RunInputs) -> float:
+    return float(np.linalg.norm(inputs.images.sensors.translations, axis=1).max(initial=0.0))
+
+
+def _contradicts_rigs(result: LocateResult, inputs: RunInputs) -> bool:
+    """Return whether matches inside frames put a sensor elsewhere in its rig, of which nothing is fixed."""
+    may_be = inputs.images.has_rigs and not inputs.fixed.any()
+    return may_be and any(find_contradicted_rigs(result.images, result.directions))
+
+
+def _loses(result: LocateResult, before: object) -> bool:
+    return isinstance(before, LocateResult) and bool(result.kept.sum() < before.kept.sum())
+
+
+def _run_with_other_offsets(
+    why: LocateResult | ContradictedOffsetsError | OpenSensorError,
+    inputs: RunInputs,
+    source: MatchSource,
+    clock: Clock,
+) -> tuple[RunInputs, MatchSource, LocateResult, tuple[str, ...]]:
+    """Return what to start from in place of sensors that fail, what comes of it, and a note.
+
+    They stand where matches inside frames put them, as far away as the rig has them, and are free. If these
+    say nothing else, sensors of `map` that are left open are held, and offsets that are too short to tell a
+    scale are taken for 0.
+
+    ContradictedOffsetsError, OpenSensorError: if neither is so.
+    """
+    images, freedom = source.images, inputs.options.freedom
+    directions = measure(source, inputs.options.directions, clock).directions
+    wrong = [one.statement for one in find_contradicted_rigs(images, directions)]
+    offsets = measured_offsets(images, directions)
+    is_moved = (offsets != images.sensors.translations).any()
+    may_free = freedom.adjusts_cameras(images.num_images)
+    for is_free in (True, False) if is_moved and may_free else (False,) * bool(is_moved):
+        start = with_offsets(_with_rigs(inputs, "free" if is_free else "held"), source, offsets)
+        result = _run_in_scale(*start, clock)
+        if isinstance(result, LocateResult) and not _loses(result, why):
+            doubt = f"{wrong[0]}, so sensors are placed by these matches, as far away as the rig has them"
+            suspicions = (*result.suspicions, of_model(Kind.INPUT, doubt))
+            return *start, replace(result, suspicions=suspicions), ()
+    if isinstance(why, LocateResult):
+        return inputs, source, why, ()
+    if isinstance(why, OpenSensorError):
+        if not inputs.is_component:
+            raise why
+        start, note = (_with_rigs(inputs, "held"), source), f"the sensors of rigs are held: {why.reason}"
+        return *start, _run(*start, clock), (note,)
+    longest, length, placement = _longest_offset(inputs), why.length, why.placement
+    if not (longest > 0.0 and (length > -_SHORT or measure_hold(placement).scale_sigma > _OPEN_SCALE)):
+        raise ContradictedOffsetsError(length, placement, wrong)
+    short = (
+        f"the offsets of sensors in their rigs, at most {longest:.2g}, are too short for this scene to tell "
+        "its scale"
+    )
+    start = at_one_center(inputs, source)
+    note = f"{next(iter(wrong), short)}, so the sensors of a rig are taken to share one center"
+    return *start, _run(*start, clock), (note,)
+
+
+def _with_rigs(inputs: RunInputs, rigs: RigFreedom) -> RunInputs:
+    """Return the same with the poses of sensors held, or free."""
+    freedom = replace(inputs.options.freedom, rigs=rigs)
+    return replace(inputs, options=replace(inputs.options, freedom=freedom))
 
 
 def at_one_center(inputs: RunInputs, source: MatchSource) -> tuple[RunInputs, MatchSource]:
     """Return the same where the sensors of a rig share one center, so that nothing tells the scale."""
-    sensors = inputs.images.sensors
-    at_one = sensors.rotations, np.zeros_like(sensors.translations)
-    images = source.images.with_sensors(*at_one)
-    return replace(inputs, images=inputs.images.with_sensors(*at_one)), source.at(images)
+    return with_offsets(inputs, source, np.zeros_like(inputs.images.sensors.translations))
+
+
+def with_offsets(
+    inputs: RunInputs, source: MatchSource, translations: FloatArray
+) -> tuple[RunInputs, MatchSource]:
+    """Return the same with other translations (l, 3) of sensors_from_rig."""
+    sensors = inputs.images.sensors.rotations, translations
+    images = source.images.with_sensors(*sensors)
+    return replace(inputs, images=inputs.images.with_sensors(*sensors)), source.at(images)
 
 
 def find_remedies(result: LocateResult, inputs: RunInputs, source: MatchSource) -> Iterator[Remedy]:

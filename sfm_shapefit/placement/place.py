@@ -5,7 +5,7 @@ its own. The largest is the answer; the others are kept apart. Rigid groups, suc
 the fixed cameras, have one piece, the groups that the pairs tie to one another.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, Self
@@ -142,11 +142,14 @@ class Placement(Displayed):
 class ContradictedOffsetsError(UnsolvableError):
     """The offsets inside rigid groups come out with no length, or a negative one."""
 
-    def __init__(self, length: float, placement: Placement) -> None:
-        """Keep the offsets' length, in baselines, and the placement, right where they are too short."""
+    def __init__(self, length: float, placement: Placement, wrong: Sequence[str] = ()) -> None:
+        """Keep the offsets' length, in baselines, and the placement, right where they are too short.
+
+        Which sensors are wrong is said in sentences, if that is known.
+        """
         super().__init__(
             "the directions contradict the known offsets between cameras: their scale comes out as "
-            f"{length:.1e} of a baseline; check the rigs, or which cameras are fixed"
+            f"{length:.1e} of a baseline; {'; '.join(wrong) or 'check the rigs, or which cameras are fixed'}"
         )
         self.length, self.placement = length, placement
 

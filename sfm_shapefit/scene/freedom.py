@@ -41,8 +41,8 @@ class FreedomOptions(Settings):
         "held",
         'Poses of the sensors in their rigs: "held", as they are; "free", refined, one pose for all frames '
         "each. The reference sensors stay, and so does the mean distance of the others "
-        "from them: the scale is still that of the rigs. Refused where the matches do not "
-        "determine a sensor's pose.",
+        "from them: the scale is still that of the rigs. Where the matches do not determine a "
+        "sensor's pose, `locate` refuses, and `map` holds all.",
     )
 
     def __post_init__(self) -> None:

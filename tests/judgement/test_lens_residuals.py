@@ -116,3 +116,13 @@ def test_few_images_are_no_evidence_and_few_residuals_are_not_drawn(scene):
         model.deregister_frame(frame)
     read = read_model(model)
     assert lens_fields(structure_of(read.arrays, read.images)) == ()
+
+
+def test_a_focal_length_far_from_the_calibration_of_the_database_is_to_be_looked_at(scene):
+    model = pycolmap.Reconstruction(scene)
+    model.cameras[1].params = [750.0, 320.0, 240.0, 0.0]  # for 500 px
+    for database, said in ((scene.parents[1] / "database.db", True), (None, False)):
+        found = check(model, database, second_opinion=False).verdict.findings
+        assert (
+            any("a focal length 1.50 times the one that was known" in one.sentence for one in found) == said
+        )

@@ -197,18 +197,27 @@ def test_offsets_too_short_to_tell_the_scale_leave_it_open_and_that_is_said(tmp_
         assert ["are too short for this scene to tell its scale" in said for said in found.warnings] == [True]
 
 
-def test_offsets_that_matches_contradict_are_not_said_to_be_short(tmp_path):
-    write_scene(tmp_path, [ONE, STEREO], [Shots(1, (0, 1))] * 8, seed=3)
+@pytest.mark.parametrize(
+    ("turn_deg", "center", "told"),
+    [
+        (0.0, (0.0, 0.0, 0.5), "matches inside its frame contradict by 9"),  # degrees
+        (0.0, (-0.5, 0.0, 0.0), "matches inside its frame contradict by 1"),
+        (90.0, (0.5, 0.0, 0.0), "turn camera 3 by 90 degrees from where the rig has it"),
+    ],
+)
+def test_map_follows_the_matches_that_contradict_a_rig_and_says_so(tmp_path, turn_deg, center, told):
+    truth = write_scene(tmp_path, [ONE, STEREO], [Shots(1, (0, 1))] * 8, seed=3)
+    turn = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
     with pycolmap.Database.open(tmp_path / "database.db") as database:
         (rig,) = (one for one in database.read_all_rigs() if one.num_sensors() == 2)
         ((sensor, _),) = rig.non_ref_sensors.items()
-        ahead = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.0, 0.0, 0.5]))  # right, in truth
-        rig.set_sensor_from_rig(sensor, ahead)
+        rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ center))
         database.update_rig(rig)
-    found = sfm_shapefit.map_database(tmp_path / "database.db").models[0]
-    assert "a place in its rig that matches inside its frame contradict by 9" in found.warnings[0]
-    assert found.warnings[0].endswith("so the sensors of a rig are taken to share one center")
-    assert not any("too short" in said for said in found.warnings)
+    (found,) = sfm_shapefit.map_database(tmp_path / "database.db").models
+    (finding,) = found.verdict.findings
+    assert told in finding.sentence
+    assert found.verdict.grade == "look"
+    assert_right(found.reconstruction, truth, most=0.01, metric=True)
 
 
 def test_sensors_that_share_a_center_turn_but_stay_there_if_rigs_are_free(six):

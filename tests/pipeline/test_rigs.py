@@ -427,6 +427,8 @@ def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
     write_workspace(scene, tmp_path / "facade")
     with pytest.raises(InputError, match=r"the matches do not tell where camera [34] is in its rig"):
         sfm_shapefit.locate(tmp_path / "facade" / "sparse" / "0", rigs="free")
+    (mapped,) = sfm_shapefit.map_database(tmp_path / "facade" / "database.db", rigs="free").models
+    assert mapped.warnings[0].startswith("the sensors of rigs are held: the matches do not tell where camera")
     for call in (
         lambda: sfm_shapefit.map_database(RING / "database.db", rigs="free"),
         lambda: sfm_shapefit.locate(RING / "sparse" / "0", rigs="free"),

@@ -14,7 +14,7 @@ nothing else of the user's. Pairs whose matches fit a homography say nothing, so
 
 import sqlite3
 import tempfile
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +28,7 @@ from sfm_shapefit.files.colmap.quiet import quiet_stderr
 from sfm_shapefit.files.colmap.reconstructions import PYCOLMAP_ERRORS
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import Origin
+from sfm_shapefit.scene.lens import Lens, Origin
 from sfm_shapefit.scene.matches import PairNames, indices_of_pairs
 from sfm_shapefit.scene.same_images import same_images
 
@@ -66,15 +66,10 @@ def find_uncalibrated(
     Raises:
         InputError: if the database cannot be read.
     """
-    columns = ("name", "camera_id")
-    rows = database.rows("images", {columns: "SELECT name, camera_id FROM images"})
-    places = same_images([str(name) for name, _ in rows], images.names).places.tolist()
-    camera_ids = {place: camera_id for place, (_, camera_id) in zip(places, rows, strict=True)}
-    cameras = read_cameras(database).usable
     uncalibrated: dict[int, Uncalibrated] = {}
-    for image, number in enumerate(images.lens_of.tolist()):
-        lens, camera = images.lenses[number], cameras.get(camera_ids.get(image, -1))
-        if number in uncalibrated or camera is None or camera.model_name != lens.model:
+    for number, camera in _cameras_of_lenses(database, images):
+        lens = images.lenses[number]
+        if number in uncalibrated or camera.model_name != lens.model:
             continue
         focal = camera.focal_length_idxs()[:1]  # none of a panorama
         if focal and (lens.parameters == tuple(camera.params.tolist()) or lens.id in listed):
@@ -86,6 +81,37 @@ def find_uncalibrated(
         # A calibration leaves the distortion as it was where the images do not tell it; EXIF does everywhere.
         known.add(Origin.EXIF)
     return {number: one for number, one in uncalibrated.items() if one.origin not in known}
+
+
+def calibrated_focals(database: DatabaseFile, images: Images) -> dict[int, float]:
+    """Return the focal lengths in pixels that a database has by calibration, by the rows of their lenses.
+
+    Lenses of another size, or of another kind of projection, are those of other pictures.
+
+    Raises:
+        InputError: if the database cannot be read.
+    """
+    found: dict[int, float] = {}
+    for number, camera in _cameras_of_lenses(database, images):
+        lens = images.lenses[number]
+        is_alike = (camera.width, camera.height) == (lens.width, lens.height) and (
+            camera.model_name == lens.model or (lens.is_plane and Lens(camera.model_name, ()).is_plane)
+        )
+        if number not in found and is_alike and _origin(camera) is Origin.CALIBRATION:
+            found[number] = float(camera.mean_focal_length())
+    return found
+
+
+def _cameras_of_lenses(database: DatabaseFile, images: Images) -> Iterator[tuple[int, pycolmap.Camera]]:
+    """Yield for each image that a database has the row of its lens, and the camera there."""
+    columns = ("name", "camera_id")
+    rows = database.rows("images", {columns: "SELECT name, camera_id FROM images"})
+    places = same_images([str(name) for name, _ in rows], images.names).places.tolist()
+    camera_ids = {place: camera_id for place, (_, camera_id) in zip(places, rows, strict=True)}
+    cameras = read_cameras(database).usable
+    for image, number in enumerate(images.lens_of.tolist()):
+        if (camera := cameras.get(camera_ids.get(image, -1))) is not None:
+            yield number, camera
 
 
 def fisheye_guess(camera: pycolmap.Camera) -> float:

@@ -319,18 +319,12 @@ def refuse_rigs(options: MatchingOptions, names: Sequence[str]) -> None:
     """Refuse rigs that these images cannot be.
 
     Raises:
-        InputError: if no image begins with a sensor's prefix, or a sensor has no pose.
+        InputError: if no image begins with a sensor's prefix.
     """
     path, rigs = options.rig_config_path, _read_rigs(options)
     for prefix in _prefixes_of(rigs):
         if not any(name.startswith(prefix) for name in names):
             raise InputError(f"{path}: no image begins with {prefix}; the first is {names[0]}")
-    for sensor in (sensor for rig in rigs for sensor in rig.cameras):
-        if not sensor.ref_sensor and sensor.cam_from_rig is None:
-            raise InputError(
-                f"{path}: {sensor.image_prefix} lacks cam_from_rig_rotation or cam_from_rig_translation; "
-                "give both, or map the images without a file of rigs"
-            )
 
 
 def _prefixes_of(rigs: Sequence[pycolmap.RigConfig]) -> list[str]:
