@@ -35,7 +35,7 @@ class Structure:
     @cached_property
     def pixels(self) -> Widened:
         """Where the observations are, (o, 2); read once for all that ask."""
-        stored: npt.NDArray[np.floating] = np.empty((len(self.points.images), 2), dtype=np.float32)
+        stored: npt.NDArray[np.floating] = np.zeros((len(self.points.images), 2), dtype=np.float32)
         for image, rows in enumerate(self.rows_of_images):
             if len(rows):
                 pixels = self.pictures.pixels(image, self.points.keypoints[rows])
