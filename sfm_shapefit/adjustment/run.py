@@ -47,7 +47,7 @@ from sfm_shapefit.adjustment.solve import (
 )
 from sfm_shapefit.adjustment.sources import Links, with_rays_of
 from sfm_shapefit.adjustment.views import views_of
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, hand_back_memory
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.executors import HERE, Crew
 from sfm_shapefit.base.threads import count_threads
@@ -180,6 +180,7 @@ class AdjustmentRun:
     ) -> AdjustmentProblem:
         """Return the problem of few of the points found, or of some times as many."""
         refuse_without_points(len(found.points))
+        hand_back_memory()  # what points were made of
         thin = tracks.of_points(found.points_seen)
         images = views_of(self.images).images.astype(np.int32)[thin.cameras[:]]
         chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, self.images.num_images, times)
@@ -440,22 +441,19 @@ def solve_thinly_again(run: AdjustmentRun) -> Solved:
 def problem_of_poses(run: AdjustmentRun) -> tuple[AdjustmentProblem | None, AdjustmentProblem | None]:
     """Return the fine problem; None where the points found say that poses are coarse, and the coarse one."""
     joined, found = run.triangulate(1.0)
-    checked = found.of_length(run.checked_length)
-    problem = run.thin_problem(joined, found, times=FINE_TIMES) if len(checked.points) else None
+    num_fine = found.count_seen(run.checked_length)
+    problem = run.thin_problem(joined, found, times=FINE_TIMES) if num_fine else None
     del joined, found  # whose arrays have all matches
-    coarse = _coarse_points(run, checked)
+    coarse = _coarse_points(run, num_fine)
     return (None, run.thin_problem(*coarse)) if coarse else (problem, None)
 
 
-def _coarse_points(
-    run: AdjustmentRun, fine: TriangulatedPoints
-) -> tuple[SeenTracks, TriangulatedPoints] | None:
-    """Return the tracks and points at the wide limit; None if poses are fine, by those at the threshold.
+def _coarse_points(run: AdjustmentRun, num_fine: int) -> tuple[SeenTracks, TriangulatedPoints] | None:
+    """Return the tracks and points at the wide limit; None if so many observations say that poses are fine.
 
     They are not looked for where nine tenths of all matched keypoints see those at the threshold.
     """
     assert run.links is not None
-    num_fine = int(np.sum(fine.points_seen >= 0))
     if 0 < num_fine >= _FINE * len(run.links.cameras):
         return None
     joined, loose = run.triangulate(_THIN_LIMIT, checked=True)
@@ -538,7 +536,7 @@ def solve_known_points(run: AdjustmentRun, points: FloatArray) -> Solved:
 def solve_from_seed(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem, float]:
     """Return what `solve_by_all_points` does, after few where poses are coarse; and the first mean error."""
     joined, found = run.triangulate(1.0, checked=True)
-    coarse = _coarse_points(run, found)
+    coarse = _coarse_points(run, found.count_seen())
     initial_error_px = mean_error_px(run.problem(joined, found))
     if coarse is not None:
         run, _ = run.solve(run.thin_problem(*coarse), _THIN_FALL, _THIN_SCALE)

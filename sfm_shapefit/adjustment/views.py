@@ -24,6 +24,8 @@ from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import CameraPoses, SeenTracks
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 
+_AT_ONCE = 1_000_000  # observations whose pixels are looked up together, since there may be very many
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Views:
@@ -58,7 +60,10 @@ class Views:
 
         Lenses among `sensors` (l,) move in their rigs. Rotations that were given have no part yet.
         """
-        used = found.points_seen >= 0
+        used = np.flatnonzero(found.points_seen >= 0).astype(np.int32)
+        pixels = np.empty((len(used), 2))
+        for first in range(0, len(used), _AT_ONCE):
+            pixels[first : first + _AT_ONCE] = tracks.pixels[used[first : first + _AT_ONCE]]
         rotations, translations = self._as_adjusted(images)._sensors(images)
         frames, lenses = images.frame_of[self.images], images.lens_of[self.images]
         rig = Rig(
@@ -73,7 +78,7 @@ class Views:
             points=found.points,
             cameras_seeing=tracks.cameras[used],
             points_seen=found.points_seen[used],
-            pixels=tracks.pixels[used].astype(np.float64),
+            pixels=pixels,
             lenses=tuple(map(_lens_of_views, images.lenses)),
             lens_of_camera=lenses,
             rig=rig,

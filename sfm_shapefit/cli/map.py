@@ -3,7 +3,7 @@
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,6 +24,9 @@ from sfm_shapefit.cli.frame import Run, command_run
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.files.matching_options import MatchingOptions
+
+if TYPE_CHECKING:
+    from sfm_shapefit.scene.given import Known
 
 _FLAGS = (
     *("control_points", "scale_bars", "known_distance", "gravity", "without", "intrinsics", "rigs"),
@@ -76,12 +79,12 @@ def map_command(
         from sfm_shapefit.commands.map import map_database
         from sfm_shapefit.pipeline.execution import open_client
 
-        notes = _match(source, made, given, run, priors) if made is not None else []
+        known, notes = _match(source, made, given, run, priors) if made is not None else (priors, [])
         if made is None and run.flags.images:
             _refuse_other_images(Path(run.flags.images), source)
         with open_client(scheduler) as client:
             found = map_database(
-                made or source, run.options, progress=run.progress, priors=priors, client=client
+                made or source, run.options, progress=run.progress, priors=known, client=client
             )
         found = replace(found, images=made and source, warnings=(*notes, *found.warnings))
         run.finish(found, source, target)
@@ -103,21 +106,24 @@ def _database_to_make(source: Path, target: Path, given: dict[str, Any]) -> Path
 
 def _match(
     images: Path, database: Path, given: dict[str, Any], run: Run[MapOptions], priors: Path | None
-) -> list[str]:
-    """Make the database, unless the run could not use a file, and return what the user should know.
+) -> tuple["Known", list[str]]:
+    """Make the database; return what files tell of its images, which is read first, and notes for the user.
 
     The report has the images then.
     """
     from sfm_shapefit.base.clock import Clock
-    from sfm_shapefit.commands.map import refuse_useless_files
     from sfm_shapefit.commands.match import begin_database, match_begun
+    from sfm_shapefit.files.colmap.database_images import read_images
+    from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+    from sfm_shapefit.pipeline.components import read_beside
 
     clock = Clock.of(run.progress, run.options.placement.solver.threads)
     begun, notes = begin_database(images, database, read_options(MatchingOptions, given), clock)
-    refuse_useless_files(database, run.options, priors)
+    with closing(DatabaseFile(database)) as file:  # what cannot be used is refused before the long work
+        _, _, known = read_beside(file, read_images(file).images, run.options, priors)
     match_begun(begun, clock)
     run.flags = replace(run.flags, images=run.flags.images or str(images))
-    return notes
+    return known, notes
 
 
 def _refuse_other_images(folder: Path, database: Path) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.place_errors import ScaleErrors, draws_at, errors_of_images
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.facts.control_points import compare_control_points
 from sfm_shapefit.facts.lengths import (
     Axes,
     LengthBetween,
@@ -24,6 +23,7 @@ from sfm_shapefit.files.colmap.listed_poses import read_by_itself
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.scale_bars import read_scale_bars
 from sfm_shapefit.pipeline.bundle import estimate_errors
+from sfm_shapefit.pipeline.gauge_choice import compare_control_points
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.scene.same_images import names_among

@@ -16,15 +16,15 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.facts.map_result import MapResult, tell_joins
 from sfm_shapefit.facts.map_warnings import lost_bars, lost_distances, map_warnings
-from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.components import MapContext, read_beside, start_run
+from sfm_shapefit.pipeline.components import MapContext, start_run
 from sfm_shapefit.pipeline.execution import workers_of
 from sfm_shapefit.pipeline.mapping import follow_turns, join_mapped, locate_components, refine_intrinsics
 from sfm_shapefit.rotations.sequences import Loop, Videos
+from sfm_shapefit.scene.given import Known
 from sfm_shapefit.scene.lens import FOCAL
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def map_database(
     options: MapOptions | None = None,
     *,
     progress: Progress | None = None,
-    priors: Path | str | None = None,
+    priors: Path | str | Known | None = None,
     client: "Client | None" = None,
     **overrides: Any,
 ) -> MapResult:
@@ -53,8 +53,9 @@ def map_database(
         options: settings, see `help(MapOptions)`; defaults if None.
         **overrides: single options by name: `map_database(database, adjust="full")`.
         progress: called as stages advance.
-        priors: a table of position priors, as of `locate`. Components with fewer than two keep the scale
-            "unit", and so do those, with a warning, whose priors coincide or contradict the cameras.
+        priors: a table of position priors, as of `locate`, or what was read of all files already.
+            Components with fewer than two keep the scale "unit", and so do those, with a warning, whose
+            priors coincide or contradict the cameras.
         client: of dask.distributed, whose workers share the work, as of `locate`. None: all is done here.
 
     Returns:
@@ -74,14 +75,8 @@ def map_database(
         return map_opened(file, options, clock, priors)
 
 
-def refuse_useless_files(database: Path, options: MapOptions, priors: Path | str | None) -> None:
-    """Raise InputError if `map_database` could not use the files; the database needs no features yet."""
-    with closing(DatabaseFile(database)) as file:
-        read_beside(file, read_images(file).images, options, priors)
-
-
 def map_opened(
-    file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | None = None
+    file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | Known | None = None
 ) -> MapResult:
     """Do what `map_database` does, with a database that is open."""
     run = start_run(file, options, clock, priors)

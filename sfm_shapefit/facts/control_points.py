@@ -1,27 +1,16 @@
 """What is told of ground control points: a row for each, warnings, and one sentence on all."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import UNMOVED, Alignment, rotation_angles_deg
+from sfm_shapefit.base.geometry import Alignment
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, in_unit
-from sfm_shapefit.files.colmap.geodesy import earth, enu_of
-from sfm_shapefit.files.colmap.marks import look_at_marks
-from sfm_shapefit.placement.control_points import (
-    ControlFit,
-    TriangulatedMarks,
-    fit_control_points,
-    triangulate_marks,
-)
-from sfm_shapefit.scene.given import ControlPoints, EarthDatum
-from sfm_shapefit.scene.images import Images
-from sfm_shapefit.tracks.structure_options import StructureOptions
+from sfm_shapefit.placement.control_points import ControlFit, TriangulatedMarks
+from sfm_shapefit.scene.given import ControlPoints
 
 
 class ControlPoint(Record):
@@ -165,43 +154,3 @@ def rms_of(rows: Sequence[ControlPoint], use: str) -> float | None:
     """Return the root mean square of the errors of the points of one use; None if there are none."""
     errors = [row.error for row in rows if row.use == use and row.error is not None]
     return float(np.sqrt(np.mean(np.square(errors)))) if errors else None
-
-
-def compare_control_points(
-    images: Images, known: ControlPoints, datum: EarthDatum | None
-) -> tuple[ControlComparison, list[str]]:
-    """Return how the posed images of a model, with its datum if it has one, agree with points, and warnings.
-
-    The model is mapped onto the control points, or compared as it stands where these cannot tell how.
-    InputError if it cannot be compared so: points on Earth, and a model without a datum.
-    """
-    if known.datum and datum:
-        geodetic = earth().enu_to_ellipsoid(known.positions, *known.datum.geodetic)
-        known = replace(known, positions=enu_of(geodetic, datum))
-    found = triangulate_marks(known, look_at_marks(images, known), StructureOptions())
-    fit, warnings, alignment = fit_control_points(known, found.positions), list[str](), None
-    if isinstance(fit, str):
-        if known.datum and not datum:
-            raise InputError(
-                f"{fit}; the model does not say where on Earth it is, so it cannot be compared as it stands: "
-                "mark more control points, or give a model that was placed with latitudes and longitudes"
-            )
-        how = f"as the model stands: {fit}"
-        warnings += [] if known.why_too_few() else [how]
-        known = replace(known, is_check=np.ones(len(known.names), dtype=np.bool_))
-        fit = ControlFit(UNMOVED, ~known.is_check, 0.0, found.positions - known.positions, np.nan)
-    else:
-        own, alignment = found.positions[fit.fitting], fit.motion.facts
-        moved = float(np.linalg.norm((fit.motion.apply(own) - own).mean(axis=0)))
-        turned = rotation_angles_deg(fit.motion.rotation[None])[0]
-        onto = f"after a similarity onto {counted(len(own), 'control point')}"
-        how = f"{onto}: scale {alignment.scale:.6g}, turned by {turned:.3g} deg, moved by {moved:.3g}"
-    rows = tuple(control_rows(known, found, fit))
-    compared = ControlComparison(
-        statement=f"{known.statement}; {how}",
-        points_from_model=alignment,
-        control_rms=rms_of(rows, "control"),
-        check_rms=rms_of(rows, "check"),
-        points=rows,
-    )
-    return compared, [*warnings, *control_warnings(known, found, fit, images.names)]

@@ -31,6 +31,9 @@ from sfm_shapefit.scene.given import EarthDatum
 
 TableName = Literal["cameras", "pairs", "control_points"]
 Column = npt.NDArray[Any]
+_QUOTED = '",\r\n'
+"""Signs that make a cell stand in quotes."""
+_ROWS_AT_ONCE = 10_000  # rows that are made texts together; those of pairs take 10 MB
 _BYTE = re.compile(r"\\u(dc[89a-f][0-9a-f])")
 
 
@@ -198,7 +201,7 @@ def _cell(value: Any) -> Any:
 def write_rows(rows: Table[R], path: Path) -> None:
     """Write rows as CSV; a vector of d numbers becomes d columns, one per axis."""
     with open_table(path) as stream:
-        write_csv({name: values.tolist() for name, values in rows.flat().items()}, stream)
+        write_csv(rows.flat(), stream)
 
 
 def contradicting(pairs: Table[PairRow]) -> BoolArray:
@@ -298,31 +301,39 @@ def open_table(path: Path) -> TextIO:
     return path.open("w", newline="", encoding="utf-8", errors="backslashreplace")
 
 
-def write_csv(columns: Mapping[str, Sequence[object]], stream: TextIO) -> None:
-    """Write columns under their names."""
-    rows = zip(*map(_cells, columns.values()), strict=True)
+def write_csv(columns: Mapping[str, Sequence[object] | Column], stream: TextIO) -> None:
+    """Write columns under their names; numbers round-trip, None and numbers that are not finite are empty."""
     bare = csv.writer(stream, lineterminator="\n")
     quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
     bare.writerow(columns)
-    if not any(map(_has_return, columns.values())):
-        bare.writerows(rows)
-    for row in rows:  # a carriage return ends a line for others, which `csv` forgets
-        (quoted if _has_return(row) else bare).writerow(row)
+    for first in range(0, max(map(len, columns.values())), _ROWS_AT_ONCE):
+        cells = [_cells(values[first : first + _ROWS_AT_ONCE]) for values in columns.values()]
+        rows, words = zip(*cells, strict=True), "".join(map("".join, cells))
+        if len(columns) > 1 and not any(sign in words for sign in _QUOTED):
+            stream.write("\n".join(map(",".join, rows)) + "\n")
+            continue
+        for row in rows:  # a carriage return ends a line for others, which `csv` forgets
+            (quoted if any("\r" in text for text in row) else bare).writerow(row)
 
 
-def _has_return(cells: Sequence[object]) -> bool:
-    """Return whether one of some texts, beside which there may be other things, has a carriage return."""
-    return str in set(map(type, cells)) and any("\r" in str(cell) for cell in cells)
-
-
-def _cells(values: Sequence[object]) -> Sequence[object]:
-    """Return values as `csv` is to write them; itself it writes numbers that round-trip, None as nothing."""
-    kinds = set(map(type, values))
+def _cells(values: Sequence[object] | Column) -> list[str]:
+    """Return values as texts; those of Python round-trip."""
+    if isinstance(values, np.ndarray) and values.dtype == np.float64:
+        is_known = np.isfinite(values)
+        if not is_known.any():
+            return [""] * len(values)
+        texts = list(map(repr, values.tolist()))
+        for row in np.flatnonzero(~is_known).tolist():
+            texts[row] = ""
+        return texts
+    plain: list[Any] = values.tolist() if isinstance(values, np.ndarray) else list(values)
+    kinds = set(map(type, plain))
+    if kinds <= {str}:
+        return plain
     if bool in kinds:
-        return [str(value).lower() for value in values]
-    if float not in kinds:
-        return values
-    return ["" if isinstance(value, float) and not math.isfinite(value) else value for value in values]
+        return [str(value).lower() for value in plain]
+    unknown = (value is None or (isinstance(value, float) and not math.isfinite(value)) for value in plain)
+    return ["" if is_so else str(value) for value, is_so in zip(plain, unknown, strict=True)]
 
 
 class Tabled:

@@ -73,7 +73,7 @@ class MeasuredGraph:
     @property
     def is_pair(self) -> BoolArray:
         """(m,) whether an edge joins two cameras; the others join a camera and a point."""
-        first, second = self.graph.edges.T < self.num_cameras
+        first, second = self.num_cameras > self.graph.edges.T
         return np.asarray(first & second)
 
     @property

@@ -6,6 +6,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.base.record import Record
@@ -14,6 +15,9 @@ from sfm_shapefit.scene.epipolar import sampson_px, write_ray
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints
+
+_MATCHES_A_SLICE = 250_000  # matches that are looked at by one thread, and then counted: about 10 ms
+_HAS_NO_PART, _FITS, _MISSES = range(3)  # what is found of a match
 
 
 def images_of_few_points(points: Points, images: Images, least: IntArray, fixed: BoolArray) -> IntArray:
@@ -113,16 +117,26 @@ class PartnerCounts:
         """Return counts of nothing yet for images others of which are posed."""
         return PartnerCounts(images, self._num_keypoints, self._max_error_px, self._fixed)
 
-    def add(self, matched: MatchedKeypoints, poses: CameraPoses) -> None:
-        """Count the matches of further pairs; `poses` are of their cameras, with the rows of all images."""
+    def add(self, matched: MatchedKeypoints, poses: CameraPoses, threads: int = 1) -> None:
+        """Count the matches of further pairs; `poses` are of their cameras, with the rows of all images.
+
+        Threads look which matches miss; one counts these in their order.
+        """
         last = np.full(len(matched.cameras), -1, dtype=np.int32)
         given = (
-            matched.on_plane, matched.cameras, matched.keypoints, poses.rotations, poses.centers,
-            poses.focal_lengths_px, poses.images, self._posed, self._free, self._max_error_px, self._begins,
-            last, self._counts,
+            matched.on_plane, matched.cameras, poses.rotations, poses.centers, poses.focal_lengths_px,
+            poses.images, self._posed, self._free, self._max_error_px,
         )  # fmt: skip
-        for matches in matched.slices():
-            _count_misses(matches, *given)
+        for some in matched.slices():
+            slices = [
+                some[first : first + _MATCHES_A_SLICE] for first in range(0, len(some), _MATCHES_A_SLICE)
+            ]
+            found = in_threads(threads, lambda matches: _find_misses(matches, *given), slices)
+            for matches, kinds in zip(slices, found, strict=True):
+                _count_misses(
+                    matches, kinds, matched.cameras, matched.keypoints, poses.images, self._begins, last,
+                    self._counts,
+                )  # fmt: skip
 
     def compare(self, points: Points) -> ObservationCounts:
         """Return how many observations of each image agree with the cameras, and how many contradict them.
@@ -158,21 +172,21 @@ def images_without_support(counts: ObservationCounts, images: Images, fixed: Boo
 
 
 @kernel
-def _count_misses(
-    matches: Any, on_plane: Any, cameras: Any, keypoints: Any, rotations: Any, centers: Any,
-    focal_lengths_px: Any, images: Any, posed: Any, free: Any, max_error_px: float, begins: Any, last: Any,
-    counts: Any,
-) -> None:  # fmt: skip
-    """Count the partners of each keypoint in other images, and those of them that miss their epipolar lines.
+def _find_misses(
+    matches: Any, on_plane: Any, cameras: Any, rotations: Any, centers: Any, focal_lengths_px: Any,
+    images: Any, posed: Any, free: Any, max_error_px: float,
+) -> Any:  # fmt: skip
+    """Return whether each match misses its epipolar line, fits, or has no part, (m,).
 
-    `last` has the image that was counted last for each matched keypoint, `begins` where the keypoints of each
-    image begin in `counts`. Two images in one place, whose baseline is 0, contradict nothing.
+    Two images in one place, whose baseline is 0, contradict nothing.
     """
     u, v, d = np.empty((3, 3))
+    found = np.empty(len(matches), np.int8)
     for m in range(len(matches)):
         i, j = cameras[matches[m, 0]], cameras[matches[m, 1]]
         first, second = images[i], images[j]
         if not (posed[first] and posed[second] and (free[first] or free[second])):
+            found[m] = _HAS_NO_PART
             continue
         square = 0.0
         for c in range(3):
@@ -184,10 +198,27 @@ def _count_misses(
         write_ray(on_plane[matches[m, 0]], rotations[i], u)
         write_ray(on_plane[matches[m, 1]], rotations[j], v)
         misses = sampson_px(u, v, d, 1.0 / min(focal_lengths_px[i], focal_lengths_px[j])) > max_error_px
+        found[m] = _MISSES if misses else _FITS
+    return found
+
+
+@kernel
+def _count_misses(
+    matches: Any, found: Any, cameras: Any, keypoints: Any, images: Any, begins: Any, last: Any, counts: Any
+) -> None:
+    """Count the partners of each keypoint in other images, and those of them that miss their epipolar lines.
+
+    `last` has the image that was counted last for each matched keypoint, `begins` where the keypoints of each
+    image begin in `counts`.
+    """
+    for m in range(len(matches)):
+        if found[m] == _HAS_NO_PART:
+            continue
         for side in range(2):
-            row, image, other = matches[m, side], second if side else first, first if side else second
+            row = matches[m, side]
+            image, other = images[cameras[row]], images[cameras[matches[m, 1 - side]]]
             if last[row] != other:  # a keypoint may be matched twice with one image
                 own = counts[begins[image] + keypoints[row]]
                 own[0] += 1
-                own[1] += misses
+                own[1] += found[m] == _MISSES
                 last[row] = other

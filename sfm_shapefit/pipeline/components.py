@@ -37,7 +37,7 @@ from sfm_shapefit.scene.matches import PairNames, View
 
 
 def start_run(
-    file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | None
+    file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | Known | None
 ) -> "MapContext":
     """Read what a run works from: the database, and the files that the options name."""
     with clock("read"):
@@ -62,13 +62,13 @@ def start_run(
 
 
 def read_beside(
-    file: DatabaseFile, images: Images, options: MapOptions, priors: Path | str | None
+    file: DatabaseFile, images: Images, options: MapOptions, priors: Path | str | Known | None
 ) -> tuple[MapOptions, Inputs, Known]:
     """Read what the options tell of the images of a database, which needs no features for that.
 
     Returns:
         the options with their distances between these images, the inputs with the pairs that are left out,
-        and what is known of the images.
+        and what is known of the images; with `priors` of that kind, it has been read already.
 
     Raises:
         InputError: if a file cannot be used, or an option is not for these images.
@@ -77,15 +77,11 @@ def read_beside(
         raise InputError(f"{file.path} has no rig of several cameras to refine; leave out rigs=free")
     inputs = read_left_out(inputs_from(file.path), images.names, options.directions.without)
     gauge = between_images(options.gauge, images.names, "the database has no image")
-    known = read_known(
-        images,
-        file,
-        priors,
-        control_points=gauge.control_points,
-        scale_bars=gauge.scale_bars,
-        gravity=options.averaging.gravity,
-    )
-    return replace(options, gauge=gauge), inputs, known
+    options, gravity = replace(options, gauge=gauge), options.averaging.gravity
+    if isinstance(priors, Known):
+        return options, inputs, priors
+    files = {"control_points": gauge.control_points, "scale_bars": gauge.scale_bars, "gravity": gravity}
+    return options, inputs, read_known(images, file, priors, **files)
 
 
 class MapContext(NamedTuple):

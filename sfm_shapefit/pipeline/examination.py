@@ -8,7 +8,7 @@ import numpy as np
 from sfm_shapefit.adjustment.lens_doubts import excess
 from sfm_shapefit.adjustment.open_shape import estimate_open_shape
 from sfm_shapefit.adjustment.sources import Links
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.base.geometry import fit_similarity
@@ -18,9 +18,8 @@ from sfm_shapefit.files.colmap.lenses import is_bogus
 from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
 from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape
-from sfm_shapefit.judgement.flights import find_flights
-from sfm_shapefit.judgement.lens_residuals import find_bent_lenses, lens_fields
-from sfm_shapefit.judgement.lenses import find_changed_lenses, find_odd_lenses
+from sfm_shapefit.judgement.lens_questions import ask_points
+from sfm_shapefit.judgement.lenses import find_changed_lenses
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, SMALLEST_SHAPE
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
 from sfm_shapefit.judgement.resolutions import find_outside
@@ -29,7 +28,6 @@ from sfm_shapefit.judgement.seams import GroupApart, find_cuts, find_seams
 from sfm_shapefit.judgement.tied_groups import rigid_strip, tie_images
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.witnesses import are_confirmed
-from sfm_shapefit.judgement.wrong_lenses import question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.state import ModelState
@@ -39,7 +37,6 @@ from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.links import ObservedTracks
 
 _OPEN = 1e100  # squared units; larger covariances overflow, and mean that nothing holds a camera
-_MOST_ASKED = 200  # images of a lens that are left out; each takes 1.4 ms, and a median of so many is exact
 
 
 def gather_evidence(
@@ -50,10 +47,8 @@ def gather_evidence(
     Images and `fits`, those of all pairs, are at the rotations of the model; None if no pair has a direction.
     """
     images = structure.images
-    _, lenses = question_lenses(structure, threads, images_to_ask(images, structure.asked))
     bogus = np.array([is_bogus(lens) for lens in images.lenses], dtype=np.bool_)
-    fields = lens_fields(structure)
-    odd = (*find_odd_lenses(structure, bogus), *find_bent_lenses(fields, images.names), *find_flights(images))
+    lenses, fields, odd = ask_points(structure, bogus, threads)
     if fits is None:
         return ModelEvidence(lenses=lenses, odd=odd, fields=fields)
     odd = (*odd, *find_contradicted_rigs(images, fits.directions))
@@ -191,24 +186,6 @@ def open_beyond_noise(state: ModelState, shape: OpenShape) -> FloatArray:
     judged, scale = state.judged, state.gauge.similarity.scale
     known = np.clip(judged.covariances, -_OPEN, _OPEN)  # a camera that hangs loose has huge ones
     return excess(shape.covariances[judged.cameras] / scale**2, known)
-
-
-def images_to_ask(images: Images, asked: BoolArray | None) -> BoolArray | None:
-    """Return which images (i,) are asked for their focal length: of a lens that took very many, only some.
-
-    Panoramas have none.
-    """
-    panoramas = np.array([lens.is_panorama for lens in images.lenses], dtype=np.bool_)[images.lens_of]
-    if panoramas.any():
-        asked = ~panoramas if asked is None else asked & ~panoramas
-    every = np.bincount(images.lens_of[images.is_posed])
-    if every.max(initial=0) <= _MOST_ASKED:
-        return asked
-    some = images.is_posed if asked is None else images.is_posed & asked
-    for lens in distinct(images.lens_of[some]).tolist():
-        rows = np.flatnonzero(some & (images.lens_of == lens))
-        some[rows] = np.arange(len(rows)) % -(-len(rows) // _MOST_ASKED) == 0
-    return some
 
 
 def ask_pixels(source: MatchSource, structure: Structure, doubted: Collection[str]) -> frozenset[str]:

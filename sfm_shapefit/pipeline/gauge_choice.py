@@ -11,15 +11,25 @@ import numpy as np
 from sfm_shapefit.adjustment.place_errors import ScaleErrors, draws_at, errors_of_images
 from sfm_shapefit.adjustment.scale_bars import fit_scale_bars
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.base.geometry import Similarity, mean_rotation_l1
-from sfm_shapefit.facts.control_points import control_rows, control_warnings
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import UNMOVED, Similarity, mean_rotation_l1, rotation_angles_deg
+from sfm_shapefit.base.wording import counted
+from sfm_shapefit.facts.control_points import ControlComparison, control_rows, control_warnings, rms_of
 from sfm_shapefit.facts.scale_bars import measure_bars
+from sfm_shapefit.files.colmap.geodesy import earth, enu_of
 from sfm_shapefit.files.colmap.marks import look_at_marks
 from sfm_shapefit.pipeline.state import ModelState
-from sfm_shapefit.placement.control_points import control_gauge, fit_control_points, triangulate_marks
+from sfm_shapefit.placement.control_points import (
+    ControlFit,
+    control_gauge,
+    fit_control_points,
+    triangulate_marks,
+)
 from sfm_shapefit.placement.gauge_rule import resized_gauge, say_unused
 from sfm_shapefit.placement.prior_refinement import PULLED
-from sfm_shapefit.scene.given import ControlPoints, Gravity, ScaleBars
+from sfm_shapefit.scene.given import ControlPoints, EarthDatum, Gravity, ScaleBars
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.tracks.structure_options import StructureOptions
 
 
 def bring_to_gauge(state: ModelState) -> ModelState:
@@ -88,6 +98,46 @@ def _bring_to_control_points(state: ModelState, known: ControlPoints) -> ModelSt
     if isinstance(fit, str) or not moves:
         return state
     return state.moved(fit.motion, control_gauge(state.gauge, known, fit, resize=resize))
+
+
+def compare_control_points(
+    images: Images, known: ControlPoints, datum: EarthDatum | None
+) -> tuple[ControlComparison, list[str]]:
+    """Return how the posed images of a model, with its datum if it has one, agree with points, and warnings.
+
+    The model is mapped onto the control points, or compared as it stands where these cannot tell how.
+    InputError if it cannot be compared so: points on Earth, and a model without a datum.
+    """
+    if known.datum and datum:
+        geodetic = earth().enu_to_ellipsoid(known.positions, *known.datum.geodetic)
+        known = replace(known, positions=enu_of(geodetic, datum))
+    found = triangulate_marks(known, look_at_marks(images, known), StructureOptions())
+    fit, warnings, alignment = fit_control_points(known, found.positions), list[str](), None
+    if isinstance(fit, str):
+        if known.datum and not datum:
+            raise InputError(
+                f"{fit}; the model does not say where on Earth it is, so it cannot be compared as it stands: "
+                "mark more control points, or give a model that was placed with latitudes and longitudes"
+            )
+        how = f"as the model stands: {fit}"
+        warnings += [] if known.why_too_few() else [how]
+        known = replace(known, is_check=np.ones(len(known.names), dtype=np.bool_))
+        fit = ControlFit(UNMOVED, ~known.is_check, 0.0, found.positions - known.positions, np.nan)
+    else:
+        own, alignment = found.positions[fit.fitting], fit.motion.facts
+        moved = float(np.linalg.norm((fit.motion.apply(own) - own).mean(axis=0)))
+        turned = rotation_angles_deg(fit.motion.rotation[None])[0]
+        onto = f"after a similarity onto {counted(len(own), 'control point')}"
+        how = f"{onto}: scale {alignment.scale:.6g}, turned by {turned:.3g} deg, moved by {moved:.3g}"
+    rows = tuple(control_rows(known, found, fit))
+    compared = ControlComparison(
+        statement=f"{known.statement}; {how}",
+        points_from_model=alignment,
+        control_rms=rms_of(rows, "control"),
+        check_rms=rms_of(rows, "check"),
+        points=rows,
+    )
+    return compared, [*warnings, *control_warnings(known, found, fit, images.names)]
 
 
 def _bring_to_scale_bars(state: ModelState, known: ScaleBars) -> ModelState:

@@ -44,6 +44,7 @@ def seed_points(state: ModelState, clock: Clock, confirmed: BoolArray | None = N
     points suffice for images (i,) that are `confirmed` by the pixels.
     """
     source, options, fixed = state.source, state.inputs.options, state.inputs.fixed_frames
+    threads = clock.threads
     images, points, bundle, partners = _make_points(state, clock)
     hand_back_memory()  # the links are gone
     least = np.full(len(fixed), options.structure.min_points_per_image)
@@ -54,8 +55,8 @@ def seed_points(state: ModelState, clock: Clock, confirmed: BoolArray | None = N
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), EvidenceShares()
     if source.has_database:
         if (seen >= 0).any():  # which were partners of others
-            partners = _count(state.read_links(images, nobody), images, partners.anew(images))
-        partners = _count(state.read_links(images, nobody, rejected=True), images, partners)
+            partners = _count(state.read_links(images, nobody), images, partners.anew(images), threads)
+        partners = _count(state.read_links(images, nobody, rejected=True), images, partners, threads)
         counts = partners.compare(points)
         unsupported = images_without_support(counts, images, fixed)
         if options.trust.min_trust > 0.0:
@@ -84,8 +85,9 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
         else:
             points = triangulate(posed, links, options.structure, clock.advance, clock.threads)
         counts = PartnerCounts(images, view.num_keypoints, limit_px, state.source.fixed)
-        partners = _count(links, images, counts)
+        partners = _count(links, images, counts, clock.threads)
         del links
+        hand_back_memory()
         points = filter_points(
             Structure(points, posed, state.pictures(images, rows)), options.structure, clock.threads
         )
@@ -96,12 +98,12 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
     return images, replace(points, images=rows[points.images]), bundle, partners
 
 
-def _count(links: Links, images: Images, partners: PartnerCounts) -> PartnerCounts:
+def _count(links: Links, images: Images, partners: PartnerCounts, threads: int) -> PartnerCounts:
     if isinstance(links, MatchedKeypoints):
         rows = images.posed_rows
         posed = images.part(rows)
         poses = views_of(posed).poses(posed)
-        partners.add(links, replace(poses, images=rows[poses.images]))
+        partners.add(links, replace(poses, images=rows[poses.images]), threads)
     return partners
 
 

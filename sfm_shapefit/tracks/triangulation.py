@@ -72,6 +72,11 @@ class TriangulatedPoints:
         seen = np.where(has_ray, tracks.list_of_rows(), -1)
         return cls(points=points, tracks=np.arange(tracks.num_tracks), points_seen=seen)
 
+    def count_seen(self, least: int = 1) -> int:
+        """Return how many observations are of points that have at least so many."""
+        lengths = np.bincount(self.points_seen[self.points_seen >= 0])
+        return int(lengths[lengths >= least].sum())
+
     def of_length(self, least: int) -> "TriangulatedPoints":
         """Return the points with at least that many observations; the observations of others are of none."""
         seen = self.points_seen

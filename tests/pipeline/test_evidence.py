@@ -12,16 +12,17 @@ import sfm_shapefit
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.commands.check import check
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.judgement.lens_questions import images_to_ask
 from sfm_shapefit.judgement.reasons import Grade
 from sfm_shapefit.judgement.tied_groups import lost_points
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline import examination as evidence
-from sfm_shapefit.pipeline.examination import Structure, images_to_ask
 from sfm_shapefit.pipeline.inputs import inputs_from, open_source
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.scene.structure import Structure
 from tests.models import by_name, write_priors
 from tests.scenes import COURTYARD, RING, copied, edit_database
 

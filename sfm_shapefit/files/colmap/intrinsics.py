@@ -97,7 +97,9 @@ def calibrated_focals(database: DatabaseFile, images: Images) -> dict[int, float
         is_alike = (camera.width, camera.height) == (lens.width, lens.height) and (
             camera.model_name == lens.model or (lens.is_plane and Lens(camera.model_name, ()).is_plane)
         )
-        if number not in found and is_alike and _origin(camera) is Origin.CALIBRATION:
+        if number in found or lens.is_panorama or not is_alike:
+            continue
+        if _origin(camera) is Origin.CALIBRATION:
             found[number] = float(camera.mean_focal_length())
     return found
 

@@ -165,10 +165,11 @@ class SeededModel:
             k = own.get(row)
             if k is None:
                 return model.keypoints(row)
-            records = model.keypoints(row).copy()
-            if len(self.keypoints[k]):
-                records = np.full(len(self.keypoints[k]), NO_POINT, POINT2D)
-                records["xy"], records["point3d_id"] = self.keypoints[k], NO_POINT
+            if len(xy := self.keypoints[k]):
+                records = np.empty(len(xy), POINT2D)
+                records["xy"], records["point3d_id"] = xy, NO_POINT
+            else:
+                records = model.keypoints(row).copy()
             records["point3d_id"][self.points.keypoints[rows_of[k]]] = ids[seen[rows_of[k]]]
             return records
 
