@@ -1,8 +1,9 @@
 """Where points come from: the matches of images, or the points of a model with the same keypoints."""
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -16,19 +17,19 @@ from sfm_shapefit.base.arrays import (
     distinct,
     stable_order,
 )
-from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.executors import in_slices, in_threads, overlapped
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.base.row_file import AnyRows
 from sfm_shapefit.scene.images import Images, KeypointRays
-from sfm_shapefit.scene.matches import KeypointMatches
+from sfm_shapefit.scene.matches import KeypointMatches, lens_runs
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
 
 Links = MatchedKeypoints | ObservedTracks
 """Matches, from which tracks are joined anew at each pose; or the tracks of a model."""
 
-_MATCHES_A_SLICE = 1_000_000  # matches renumbered at once; more would take a second array of all
+_MATCHES_A_SLICE = 250_000  # matches renumbered at once; more would take a second array of all
 
 
 def collect_matches(
@@ -36,8 +37,8 @@ def collect_matches(
     pictures: KeypointRays,
     place: IntArray,
     batches: Iterable[KeypointMatches],
-    num_matches: int,
-    make_rows: Callable[..., AnyRows] = np.empty,
+    room: AnyRows,
+    threads: int = 1,
 ) -> MatchedKeypoints:
     """Return all matches between posed images; batches are consumed one at a time.
 
@@ -46,44 +47,37 @@ def collect_matches(
         pictures: of the images.
         place: (n,) row in `images` of each image that the batches' pairs index; -1 for those to be left out.
         batches: matches.
-        num_matches: that the batches have at most.
-        make_rows: makes room for matches, of a shape and a type; `RowFile` where there are very many.
-
-    Raises:
-        InputError: if a match refers to a keypoint that its image does not have.
+        room: (M, 2) rows for all matches that the batches may have, of a type for the numbers of all
+            keypoints; they take the most memory, if they are not in a file.
+        threads: number of threads to share batches among; the answer does not depend on it.
     """
     counts = np.array([pictures.count(k) for k in range(images.num_images)], dtype=np.int64)
     begins = offsets_of(counts)
-    number = np.uint32 if begins[-1] < 2**32 else np.int64
-    # Memory is taken as rows are written; one array of each batch, to be joined, would take it twice.
-    room, end = make_rows((num_matches, 2), dtype=number), 0
     is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
-    for batch in batches:
-        kept = (place[batch.pairs] >= 0).all(axis=1)
-        lengths, own = batch.lengths(), batch.keypoints
+
+    def tasks() -> Iterator[tuple[KeypointMatches, BoolArray, int]]:
+        end = 0
+        for batch in batches:
+            kept = np.asarray((place[batch.pairs] >= 0).all(axis=1))
+            yield batch, kept, end
+            end += int(batch.lengths()[kept].sum())
+
+    def enter(task: tuple[KeypointMatches, BoolArray, int]) -> int:
+        batch, kept, begin = task
+        ends, lengths, own = place[batch.pairs], batch.lengths(), batch.keypoints
         if not kept.all():
-            lengths, own = lengths[kept], own[np.repeat(kept, lengths)]
-        ends = place[batch.pairs[kept]]
-        missing = (own >= np.repeat(counts[ends], lengths, axis=0)).any(axis=1)
-        if missing.any():
-            pair = ends[np.repeat(np.arange(len(ends)), lengths)[np.argmax(missing)]]
-            names = " and ".join(images.names[k] for k in pair.tolist())
-            raise InputError(
-                f"the pair {names} has matches of keypoints that do not exist; match the images again"
-            )
-        numbers = own + np.repeat(begins[ends], lengths, axis=0)
-        room[end : end + len(own)], is_matched[numbers] = numbers, True
-        end += len(own)
-    row_of = np.cumsum(is_matched, dtype=number)
-    np.subtract(row_of, 1, out=row_of)
-    for first in range(0, end, _MATCHES_A_SLICE):
-        own_slice = slice(first, min(first + _MATCHES_A_SLICE, end))
-        room[own_slice] = row_of[room[own_slice]]
-    del row_of
+            ends, lengths, own = ends[kept], lengths[kept], own.compress(np.repeat(kept, lengths), axis=0)
+        numbers = np.empty(own.shape, dtype=room.dtype)
+        np.add(own, np.repeat(begins[ends], lengths, axis=0), out=numbers, casting="unsafe")
+        room[begin : begin + len(own)], is_matched[numbers] = numbers, True
+        return begin + len(own)
+
+    end = max(overlapped(threads, enter, tasks()), default=0)
+    _renumber(room, end, is_matched, threads)
     parts = [np.flatnonzero(part).astype(np.int32) for part in np.split(is_matched, begins[1:-1])]
     taken = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
     keypoints = np.concatenate(parts)
-    cameras, pixels, on_plane = _look_up(images, pictures, taken, keypoints)
+    cameras, pixels, on_plane = _look_up(images, pictures, taken, keypoints, threads)
     return MatchedKeypoints(
         cameras=cameras,
         keypoints=keypoints,
@@ -93,10 +87,24 @@ def collect_matches(
     )
 
 
-def collect_tracks(images: Images, pictures: KeypointRays, points: Points) -> ObservedTracks:
+def _renumber(keypoints: AnyRows, count: int, chosen: BoolArray, threads: int) -> None:
+    """Replace numbers (m, 2) of chosen keypoints by their rows among these, in place."""
+    row_of: npt.NDArray[np.integer] = np.cumsum(chosen, dtype=keypoints.dtype)
+    row_of -= 1
+
+    def replace_some(begin: int, end: int) -> None:
+        keypoints[begin:end] = row_of.take(keypoints[begin:end])
+
+    in_slices(threads, count, _MATCHES_A_SLICE, replace_some)
+
+
+def collect_tracks(
+    images: Images, pictures: KeypointRays, points: Points, threads: int = 1
+) -> ObservedTracks:
     """Return the tracks of points that posed images observe; they keep the points' ids and order."""
     order = stable_order(points.images)
-    cameras, pixels, on_plane = _look_up(images, pictures, points.images[order], points.keypoints[order])
+    own = points.images[order], points.keypoints[order]
+    cameras, pixels, on_plane = _look_up(images, pictures, *own, threads)
     back = stable_order(points.points_seen()[order])
     return ObservedTracks(
         offsets=points.offsets,
@@ -145,17 +153,22 @@ def _on_plane(rays: FloatArray) -> FloatArray:
 
 
 def _look_up(
-    images: Images, pictures: KeypointRays, of: IntArray | Int32Array, keypoints: IntArray | Int32Array
+    images: Images,
+    pictures: KeypointRays,
+    of: IntArray | Int32Array,
+    keypoints: IntArray | Int32Array,
+    threads: int,
 ) -> tuple[Int32Array, npt.NDArray[np.floating], FloatArray]:
     """Return camera, pixels (m, 2) and x/z, y/z (m, 2) of keypoints; the images that they are `of` ascend."""
-    cameras = np.searchsorted(views_of(images).images, of).astype(np.int32)
-    on_plane = np.empty((len(of), 2))
-    seen: npt.NDArray[np.floating] = np.zeros((len(of), 2), dtype=np.float32)  # until 32 bits do not do
-    ends = np.searchsorted(of, np.arange(images.num_images + 1)).tolist()
-    for k, (begin, end) in enumerate(itertools.pairwise(ends)):
-        own, lens = slice(begin, end), images.lenses[images.lens_of[k]]
-        pixels = pictures.pixels(k, keypoints[own])
-        rays = pictures.rays(k, pixels)
+    first_cameras, ends = views_of(images).images, np.searchsorted(of, np.arange(images.num_images + 1))
+    cameras, on_plane = np.empty(len(of), dtype=np.int32), np.empty((len(of), 2))
+
+    def look(seen: npt.NDArray[np.floating], run: tuple[int, int]) -> bool:
+        slices = [slice(*pair) for pair in itertools.pairwise(ends[run[0] : run[1] + 1].tolist())]
+        own, lens = slice(slices[0].start, slices[-1].stop), images.lenses[images.lens_of[run[0]]]
+        pixels = np.concatenate([pictures.pixels(k, keypoints[one]) for k, one in enumerate(slices, run[0])])
+        rays = pictures.rays(run[0], pixels)
+        cameras[own] = np.searchsorted(first_cameras, of[own])
         if lens.is_plane:
             on_plane[own] = rays[:, :2] / rays[:, 2:]
         else:
@@ -165,7 +178,13 @@ def _look_up(
             if not lens.is_adjustable:
                 pixels = lens.focal_px * on_plane[own]
             cameras[own] += view
-        if not np.array_equal(pixels.astype(seen.dtype), pixels, equal_nan=True):
-            seen = seen.astype(np.float64)
         seen[own] = pixels
+        return np.array_equal(seen[own], pixels, equal_nan=True)
+
+    runs = lens_runs(images.lens_of, np.diff(ends))
+    seen: npt.NDArray[np.floating] = np.empty((len(of), 2), dtype=np.float32)
+    if not all(in_threads(threads, partial(look, seen), runs)):  # 32 bits do not do
+        seen = np.empty((len(of), 2))
+        for _ in in_threads(threads, partial(look, seen), runs):
+            pass
     return cameras, seen, on_plane

@@ -92,7 +92,7 @@ def _points_of_matches(
     partners = matched.count_partners()
     is_left = np.ones(len(partners), dtype=np.bool_)
     for limit_px in joining_limits:
-        matched, partners = matched.among(is_left), partners[is_left]
+        matched, partners = matched.among(is_left, threads), partners[is_left]
         hand_back_memory()  # before the rays of all keypoints take some
         joined = matched.join(poses, limit_px, threads)
         if limit_px < joining_limits[-1]:  # two keypoints may find a third one in the next joining

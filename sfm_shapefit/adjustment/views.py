@@ -24,7 +24,7 @@ from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import CameraPoses, SeenTracks
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 
-_AT_ONCE = 1_000_000  # observations whose pixels are looked up together, since there may be very many
+_AT_ONCE = 1_000_000  # observations whose pixels are looked up together; they take 24 MB
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -56,7 +56,7 @@ def gathered(threads: int, array: AnyArray, rows: IntArray) -> AnyArray:
     found: AnyArray = np.empty_like(array, shape=(len(rows), *array.shape[1:]))
 
     def gather(begin: int, end: int) -> None:
-        found[begin:end] = array[rows[begin:end]]
+        found[begin:end] = array.take(rows[begin:end], axis=0)
 
     in_ranges(threads, len(rows), gather)
     return found

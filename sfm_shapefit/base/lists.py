@@ -51,7 +51,7 @@ class Lists:
 
     def slices(self) -> list[slice]:
         """Return the rows of each list."""
-        return [self.slice_of(k) for k in range(len(self.offsets) - 1)]
+        return [slice(*ends) for ends in pairwise(self.offsets.tolist())]
 
     def rows_of(self, chosen: IntArray) -> "RowLists":
         """Return the rows of some lists, in that order."""
@@ -77,8 +77,9 @@ class RowLists(Lists):
 
         Rows whose label is negative are in none.
         """
-        rows = stable_order(labels)[np.sum(labels < 0) :]
-        return cls(offsets_of(np.bincount(labels[rows], minlength=count)), rows)
+        is_in = labels >= 0
+        rows = stable_order(labels)[len(labels) - np.count_nonzero(is_in) :]
+        return cls(offsets_of(np.bincount(labels.compress(is_in), minlength=count)), rows)
 
     def __iter__(self) -> Iterator[IntArray]:
         """Return the rows of each list in turn."""

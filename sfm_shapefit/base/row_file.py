@@ -1,6 +1,7 @@
 """Rows of numbers in a temporary file: what is read from end to end, and would take the most memory."""
 
 import tempfile
+import threading
 import weakref
 from typing import Any
 
@@ -24,6 +25,7 @@ class RowFile:
             self._file = tempfile.TemporaryFile(buffering=0, prefix="shapefit-")  # noqa: SIM115  closed below
         except OSError as error:
             raise InputError(f"no folder for temporary files can be written ({error}); set TMPDIR") from error
+        self._one_at_a_time = threading.Lock()  # who seeks and who reads
         weakref.finalize(self, self._file.close)
         self._row_bytes = self.dtype.itemsize * int(np.prod(self._shape))
 
@@ -35,10 +37,11 @@ class RowFile:
         """Return the rows of a slice of step 1."""
         first, end, _ = rows.indices(self._length)
         found = np.empty((max(end - first, 0), *self._shape), self.dtype)
-        self._file.seek(first * self._row_bytes)
         room = found.data.cast("B") if len(found) else memoryview(b"")
-        while len(room):  # a system call may read less, and write less
-            room = room[self._file.readinto(room) :]
+        with self._one_at_a_time:
+            self._file.seek(first * self._row_bytes)
+            while len(room):  # a system call may read less, and write less
+                room = room[self._file.readinto(room) :]
         return found
 
     def __setitem__(self, rows: slice, values: AnyArray) -> None:
@@ -48,20 +51,26 @@ class RowFile:
             InputError: if the folder of temporary files is full.
         """
         try:
-            self._file.seek(rows.start * self._row_bytes)
             left = np.ascontiguousarray(values, dtype=self.dtype).tobytes()
-            while left:
-                left = left[self._file.write(left) :]
+            with self._one_at_a_time:
+                self._file.seek(rows.start * self._row_bytes)
+                while left:
+                    left = left[self._file.write(left) :]
+                self._length = max(self._length, rows.start + len(values))
         except OSError as error:
             raise InputError(
                 f"{tempfile.gettempdir()} has no room for {self._row_bytes * rows.stop / 1e6:.0f} MB of "
                 f"matches ({error.strerror}); set TMPDIR to a folder that has"
             ) from error
-        self._length = max(self._length, rows.start + len(values))
 
 
 AnyRows = npt.NDArray[Any] | RowFile
 """Rows that slices of step 1 read and write."""
+
+
+def make_room(shape: tuple[int, ...], dtype: npt.DTypeLike, *, in_file: bool) -> AnyRows:
+    """Return room for rows, in a file or in memory, which is taken as they are written."""
+    return RowFile(shape, dtype) if in_file else np.empty(shape, dtype)
 
 
 class Widened:

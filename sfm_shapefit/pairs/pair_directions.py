@@ -1,7 +1,6 @@
 """What is known of the direction of each pair."""
 
 import enum
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -69,7 +68,9 @@ class PairDirections:
 
     def counts(self) -> dict[DirectionStatus, int]:
         """Return how many pairs have each status, most frequent first."""
-        return dict(Counter(self.status).most_common())
+        status = list(self.status)
+        met = sorted(filter(status.__contains__, DirectionStatus), key=status.index)
+        return {one: status.count(one) for one in sorted(met, key=status.count, reverse=True)}
 
     def sigma_deg(self) -> FloatArray:
         """Return the standard deviation along each direction's least certain axis, shape (k,)."""

@@ -69,7 +69,7 @@ def adjust_placed(state: ModelState, clock: Clock) -> ModelState:
     source, placement, options = state.source, state.placement, state.inputs.options
     images, placed = source.images, state.placed()
     rows = placed.posed_rows
-    start, links = placed.part(rows), state.read_links(placed, clock.advance)
+    start, links = placed.part(rows), state.read_links(placed, clock.advance, clock.threads)
     if source.fixed is not None:  # points that fixed images alone see move nothing
         links = links_touching(start, links, ~source.fixed[rows])
     freedom = replace(state.freedom_of(rows), pull_rad=state.inputs.pull_rad)

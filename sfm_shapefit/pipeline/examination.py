@@ -146,7 +146,10 @@ def shape_of(state: ModelState, threads: int) -> OpenShape | None:
     inputs, images = state.inputs, state.images
     if state.source.has_database or state.held is not None or inputs.fixed.any():
         return None
-    links, lenses_held = state.read_links(images, nobody), inputs.options.freedom.intrinsics == "held"
+    links, lenses_held = (
+        state.read_links(images, nobody, threads),
+        inputs.options.freedom.intrinsics == "held",
+    )
     knows_rotations = inputs.pull_rad is not None and inputs.pull_rad < np.inf
     held = {"lenses_held": lenses_held, "rotations_held": knows_rotations}
     return ask_shape(images, images.posed_rows, links, threads, **held)

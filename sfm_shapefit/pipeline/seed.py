@@ -55,8 +55,10 @@ def seed_points(state: ModelState, clock: Clock, confirmed: BoolArray | None = N
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), EvidenceShares()
     if source.has_database:
         if (seen >= 0).any():  # which were partners of others
-            partners = _count(state.read_links(images, nobody), images, partners.anew(images), threads)
-        partners = _count(state.read_links(images, nobody, rejected=True), images, partners, threads)
+            partners = _count(
+                state.read_links(images, nobody, threads), images, partners.anew(images), threads
+            )
+        partners = _count(state.read_links(images, nobody, threads, rejected=True), images, partners, threads)
         counts = partners.compare(points)
         unsupported = images_without_support(counts, images, fixed)
         if options.trust.min_trust > 0.0:
@@ -74,7 +76,7 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
     rows = images.posed_rows
     adjusts = options.freedom.adjust == "full"
     with clock("structure"):
-        links = state.read_links(images, clock.advance)
+        links = state.read_links(images, clock.advance, clock.threads)
     with clock("bundle adjustment" if adjusts else "triangulation"):
         posed = images.part(rows)
         if adjusts:  # which triangulates at the poses of the start itself

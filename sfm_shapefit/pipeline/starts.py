@@ -83,7 +83,7 @@ def adjust_first_placement(
         adjusted = adjust_thinly(
             begin(
                 start.part(rows),
-                placed.read_links(start, clock.advance),
+                placed.read_links(start, clock.advance, clock.threads),
                 options.structure,
                 placed.freedom_of(rows),
                 crew=placed.crew_of(clock),

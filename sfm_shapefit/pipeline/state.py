@@ -12,7 +12,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import Advance, Crew
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.base.row_file import RowFile
+from sfm_shapefit.base.row_file import make_room
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.scale_bars import MeasuredBars
@@ -199,7 +199,9 @@ class ModelState:
             images.part(rows), lambda k: view.keypoints(chosen[k]), view.num_keypoints[rows]
         )
 
-    def read_links(self, images: Images, advance: Advance, *, rejected: bool = False) -> Links:
+    def read_links(
+        self, images: Images, advance: Advance, threads: int = 1, *, rejected: bool = False
+    ) -> Links:
         """Return what joins the keypoints of posed images, or matches of rejected pairs; rays are forgotten.
 
         From here to the end of a triangulation, or an adjustment, most memory is needed.
@@ -207,12 +209,13 @@ class ModelState:
         view, rows = self.source.view, images.posed_rows
         pictures, posed = self.pictures(images, rows), images.part(rows)
         if isinstance(self.source.matches, TrackMatches):  # the model has its tracks already
-            return collect_tracks(posed, pictures, self.source.matches.points_of(posed))
+            return collect_tracks(posed, pictures, self.source.matches.points_of(posed), threads)
         wanted = is_among(view.pairs, self.placement.rejected_pairs) == rejected
         if self.among is not None:
             wanted &= np.isin(view.pairs, self.among).all(axis=1)
         links = view.links(chosen=wanted, advance=advance, consume=True)
         place = np.full(images.num_images, -1)
         place[rows] = np.arange(len(rows))
-        room = RowFile if view.num_matches > MOST_BESIDE_TRACKS else np.empty
-        return collect_matches(posed, pictures, place, links, view.num_matches, room)
+        number = np.uint32 if view.num_keypoints.sum() < 2**32 else np.int64
+        room = make_room((view.num_matches, 2), number, in_file=view.num_matches > MOST_BESIDE_TRACKS)
+        return collect_matches(posed, pictures, place, links, room, threads)

@@ -34,6 +34,7 @@ from sfm_shapefit.scene.lens import Lens
 PairNames = frozenset[tuple[str, str]]
 """Pairs of images by their names, the smaller name first."""
 
+_OBSERVATIONS_A_RUN = 50_000  # observations seen through one lens; the arrays of so many take 4 MB
 KEPT_MATCHES = 1_000_000  # matches that are kept with their rays; they take 80 MB
 # Matches of a database; of more, none is kept while points are made of them. To read 30 million again takes a
 # twentieth of the time of a run, and to keep them an eighth of its memory.
@@ -440,3 +441,16 @@ def batch_ranges(sizes: IntArray, limit: int) -> Iterator[tuple[int, int]]:
         total += size
     if first < len(sizes):
         yield first, len(sizes)
+
+
+def lens_runs(lens_of: IntArray, counts: IntArray) -> list[tuple[int, int]]:
+    """Return ranges of images (i,) that follow one another through one lens, of few observations (i,) in all.
+
+    What a lens does to them is computed at once: a call takes as long as a thousand observations.
+    """
+    ends = [0, *(1 + np.flatnonzero(np.diff(lens_of))).tolist(), len(lens_of)]
+    return [
+        (first + begin, first + end)
+        for first, last in itertools.pairwise(ends)
+        for begin, end in batch_ranges(counts[first:last], _OBSERVATIONS_A_RUN)
+    ]

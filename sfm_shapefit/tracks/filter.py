@@ -12,12 +12,10 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.lists import offsets_of
-from sfm_shapefit.scene.matches import batch_ranges
+from sfm_shapefit.scene.matches import batch_ranges, lens_runs
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.structure_options import StructureOptions
-
-_AT_ONCE = 50_000  # observations, seen through one lens, that are projected together; their arrays take 4 MB
 
 
 def filter_points(structure: Structure, options: StructureOptions, threads: int = 1) -> Points:
@@ -28,8 +26,9 @@ def filter_points(structure: Structure, options: StructureOptions, threads: int 
     errors_px[~fitting] = 0.0
     sums = np.bincount(points.points_seen(), errors_px, points.num_points)
     del errors_px
-    lengths, centers = points.count(fitting), structure.images.centers
-    is_kept = _are_wide(points, fitting, lengths, centers, options.min_triangulation_angle_deg)
+    lengths = points.count(fitting)
+    rays = fitting, lengths, structure.images.centers
+    is_kept = _are_wide(points, rays, options.min_triangulation_angle_deg, threads)
     is_kept &= lengths >= max(options.min_track_length, 1)
     points = replace(points, errors_px=sums / np.maximum(lengths, 1))
     return points.taken(fitting & is_kept[points.points_seen()])
@@ -63,38 +62,43 @@ def keypoint_offsets_px(
 
     def project(some: IntArray) -> tuple[IntArray, FloatArray]:
         observed, lens = rows_of.subset(some), images.lenses[images.lens_of[some[0]]]
-        in_camera = points.xyz[seen[observed.rows]]
+        in_camera = points.xyz.take(seen.take(observed.rows), axis=0)
         for image, own in zip(some.tolist(), observed.slices(), strict=True):
             with np.errstate(invalid="ignore"):  # a point that is not finite
                 in_camera[own] = (in_camera[own] - centers[image]) @ rotations[image].T
         found = structure.pictures.project(int(some[0]), in_camera, ahead=ahead)
         return observed.rows, lens.offsets_px(found, pixels[observed.rows])
 
-    part = np.cumsum(rows_of.lengths()[chosen]) // _AT_ONCE
-    cuts = np.flatnonzero((np.diff(part) != 0) | (np.diff(images.lens_of[chosen]) != 0)) + 1
-    return in_threads(threads, project, np.split(chosen, cuts) if len(chosen) else ())
+    runs = lens_runs(images.lens_of[chosen], rows_of.lengths()[chosen])
+    return in_threads(threads, project, (chosen[begin:end] for begin, end in runs))
 
 
 def _are_wide(
-    points: Points, chosen: BoolArray, counts: IntArray, centers: FloatArray, least_deg: float
+    points: Points, seen: tuple[BoolArray, IntArray, FloatArray], least_deg: float, threads: int
 ) -> BoolArray:
-    """Return which points two chosen observations (o,) see under an angle, or its supplement, of so much.
+    """Return which points two observations see under an angle, or its supplement, of so much.
 
-    `counts` (x,) says how many of each point are chosen.
+    Seen are chosen observations (o,), so many of each point (x,), from the centers (i, 3) of the images.
     """
     wide, cosine = np.zeros(points.num_points, dtype=np.bool_), np.cos(np.radians(least_deg))
-    for begin, end in batch_ranges(counts, 100_000):  # so that few rays are held
+    chosen, counts, centers = seen
+
+    def look(ends: tuple[int, int]) -> None:
+        begin, end = ends
         own_rows = slice(points.offsets[begin], points.offsets[end])
         lengths, images = counts[begin:end], points.images[own_rows][chosen[own_rows]]
         offsets = offsets_of(lengths)
-        rays = centers[images] - np.repeat(points.xyz[begin:end], lengths, axis=0)
+        rays = centers.take(images, axis=0) - np.repeat(points.xyz[begin:end], lengths, axis=0)
         with np.errstate(invalid="ignore"):
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         for first in range(int(lengths.max(initial=1)) - 1):
             left = np.flatnonzero(~wide[begin:end] & (lengths > first + 1))  # a few, after the first round
             own, others_of = offsets[left] + first, lengths[left] - first - 1
             others = np.repeat(own + 1 - offsets_of(others_of)[:-1], others_of)
-            ahead = rays[others + np.arange(len(others))]
+            ahead = rays.take(others + np.arange(len(others)), axis=0)
             cosines = np.abs(np.einsum("pa,pa->p", np.repeat(rays[own], others_of, axis=0), ahead))
             wide[begin + np.repeat(left, others_of)[cosines <= cosine]] = True
+
+    for _ in in_threads(threads, look, batch_ranges(counts, 100_000)):  # so that few rays are held
+        pass
     return wide

@@ -14,7 +14,7 @@ from sfm_shapefit.base.arrays import (
     Int32Array,
     IntArray,
 )
-from sfm_shapefit.base.executors import gathered, in_ranges
+from sfm_shapefit.base.executors import gathered, in_ranges, in_threads, overlapped
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.lists import Lists, RowLists
@@ -22,8 +22,8 @@ from sfm_shapefit.base.row_file import AnyRows, Gathered
 from sfm_shapefit.scene.epipolar import sampson_px, write_ray
 from sfm_shapefit.tracks.joining import list_trees
 
-# Between two slices Python can be interrupted: about 200 ms. For each all keypoints are counted.
-_MATCHES_A_SLICE = 4_000_000
+_MATCHES_A_SLICE = 4_000_000  # matches that are counted at once; for each slice all keypoints are counted
+_MATCHES_AT_ONCE = 500_000  # matches that are looked at together; Python can be interrupted in between
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,8 +82,8 @@ class ObservedTracks(Lists):
             offsets=joined.offsets,
             cameras=self.cameras[rows],
             keypoints=self.keypoints[rows],
-            pixels=self.pixels[rows],
-            on_plane=self.on_plane[rows],
+            pixels=self.pixels.take(rows, axis=0),
+            on_plane=self.on_plane.take(rows, axis=0),
             ids=ids,
         )
 
@@ -115,19 +115,25 @@ class MatchedKeypoints:
             counts += np.bincount(ends.astype(np.int64).ravel(), minlength=len(counts)).astype(np.int32)
         return counts
 
-    def among(self, chosen: BoolArray) -> "MatchedKeypoints":
-        """Return the chosen ones of the keypoints (K,), and the matches between them."""
+    def among(self, chosen: BoolArray, threads: int = 1) -> "MatchedKeypoints":
+        """Return the chosen ones of the keypoints (K,), and the matches between them; threads share these."""
         if chosen.all():
             return self
         row_of = np.cumsum(chosen, dtype=self.matches.dtype)
         row_of -= 1
-        kept = [row_of[own[chosen[own].all(axis=1)]] for own in self.slices()]
+
+        def renumbered(first: int) -> npt.NDArray[np.integer]:
+            own = self.matches[first : first + _MATCHES_AT_ONCE]
+            i, j = own.T
+            return row_of.take(own.compress(chosen.take(i) & chosen.take(j), axis=0))
+
+        matches = list(in_threads(threads, renumbered, range(0, len(self.matches), _MATCHES_AT_ONCE)))
         return MatchedKeypoints(
             cameras=self.cameras[chosen],
             keypoints=self.keypoints[chosen],
-            pixels=self.pixels[chosen],
-            on_plane=self.on_plane[chosen],
-            matches=np.concatenate([np.zeros((0, 2), dtype=self.matches.dtype), *kept]),
+            pixels=self.pixels.compress(chosen, axis=0),
+            on_plane=self.on_plane.compress(chosen, axis=0),
+            matches=np.concatenate([np.zeros((0, 2), dtype=self.matches.dtype), *matches]),
         )
 
     def join(self, poses: CameraPoses, limit_px: float, threads: int = 1) -> RowLists:
@@ -138,12 +144,20 @@ class MatchedKeypoints:
         Args:
             poses: of the cameras.
             limit_px: largest Sampson error of a match that joins.
-            threads: number of threads to share the matches among; they are joined by one.
+            threads: number of threads to share the matches among; they are joined by one, beside the others.
         """
         parents = np.arange(len(self.cameras), dtype=np.int32)
         given = self.on_plane, self.cameras, poses.rotations, poses.centers, poses.focal_lengths_px, limit_px
-        for matches in self.slices():
-            _join(matches, given, parents, threads)
+
+        def find_agreeing(first: int) -> tuple[npt.NDArray[np.integer], BoolArray]:
+            matches = self.matches[first : first + _MATCHES_AT_ONCE]
+            agree = np.empty(len(matches), dtype=np.bool_)
+            in_ranges(threads, len(matches), _find_agreeing, matches, agree, *given)
+            return matches, agree
+
+        starts = range(0, len(self.matches), _MATCHES_AT_ONCE)
+        for matches, agree in overlapped(threads, find_agreeing, starts):
+            _merge(matches, agree, parents)
         return list_trees(parents)
 
     def observed(self, joined: RowLists, threads: int = 1) -> ObservedTracks:
@@ -195,12 +209,6 @@ class JoinedKeypoints(RowLists):
 
 SeenTracks = ObservedTracks | JoinedKeypoints
 """Tracks whose observations can be looked up."""
-
-
-def _join(matches: npt.NDArray[np.integer], given: Any, parents: Int32Array, threads: int) -> None:
-    agree = np.empty(len(matches), dtype=np.bool_)
-    in_ranges(threads, len(matches), _find_agreeing, matches, agree, *given)
-    _merge(matches, agree, parents)
 
 
 @kernel

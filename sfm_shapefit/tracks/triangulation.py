@@ -165,7 +165,7 @@ def triangulate_matches(
     del joined
     left, rows = matched, np.arange(len(is_left))
     for limit_px in joining_limits_px(threshold_px, limits.max_error_px) if is_left.any() else ():
-        left, rows = left.among(is_left), rows[is_left]
+        left, rows = left.among(is_left, threads), rows[is_left]
         is_left = np.ones(len(rows), dtype=np.bool_)
         for own in left.join(poses, limit_px, threads).blocks(_JOINED_AT_ONCE):
             points, seen = _triangulate_joined(left, own, *place)

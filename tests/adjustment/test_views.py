@@ -1,6 +1,7 @@
 """A reconstruction as an adjustment problem and back: every lens, rigs, fixed frames, tracks."""
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,9 +14,11 @@ from sfm_shapefit.adjustment import run as adjustment_run
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement, adjust_thinly
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.solve import reprojection_errors_px
+from sfm_shapefit.adjustment.sources import collect_matches
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.geometry import fit_similarity
-from sfm_shapefit.files.colmap.points import points_of
+from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
+from sfm_shapefit.scene.images import Sensors
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
@@ -224,6 +227,38 @@ def test_the_tracks_of_matches_are_those_of_the_model_they_were_made_of():
         return {tuple(zip(found.cameras[a:b], found.keypoints[a:b], strict=True)) for a, b in ends}
 
     assert tracks(joined) == {track for track in tracks(own) if len(track) > 1}
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_matches_of_several_lenses_are_collected_batch_by_batch_by_any_number_of_threads(threads):
+    model = scene()
+    images, rng = posed_images(model), np.random.default_rng(0)
+    lens = images.lenses[0]
+    lenses = lens, replace(lens, id=lens.id + 1, parameters=tuple(1.1 * x for x in lens.parameters))
+    lens_of = np.arange(images.num_images) // 2 % 2  # in runs of two images
+    images = replace(images, lens_of=lens_of, lenses=lenses, sensors=Sensors.references(2))
+    pictures = ModelKeypoints(images, points2d_of(arrays(model), images))
+    every = list(itertools.combinations(range(images.num_images), 2))
+    own = [rng.permutation(20)[:12].reshape(6, 2) for _ in every]
+    batches = [
+        KeypointMatches(pairs=np.array([pair]), offsets=np.array([0, 6]), keypoints=keypoints)
+        for pair, keypoints in zip(every, own, strict=True)
+    ]
+    place = np.where(np.arange(images.num_images) == 2, -1, np.arange(images.num_images))
+    room = np.empty((6 * len(batches), 2), dtype=np.uint32)
+    found = collect_matches(images, pictures, place, batches, room, threads)
+
+    at = np.stack([found.cameras, found.keypoints], axis=1)
+    expected = [
+        [[i, k], [j, m]] for (i, j), some in zip(every, own, strict=True) for k, m in some if 2 not in (i, j)
+    ]
+    assert at[found.matches].tolist() == expected
+    assert len(np.unique(at, axis=0)) == len(at) == len(np.unique(found.matches))
+    for image in range(images.num_images):
+        rows = found.cameras == image
+        pixels = pictures.pixels(image, found.keypoints[rows])
+        np.testing.assert_array_equal(found.pixels[rows], pixels)
+        np.testing.assert_array_equal(found.on_plane[rows], pictures.rays(image, pixels)[:, :2])
 
 
 @pytest.mark.parametrize("exact", [False, True])

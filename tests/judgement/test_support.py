@@ -50,8 +50,8 @@ def counted_at(images, points, apart=NO_PAIRS, make_rows=np.empty):
         is_apart = is_among(view.pairs, apart)
         for batches in (view.links(chosen=is_apart), view.links(chosen=~is_apart)):
             pictures = ModelKeypoints(images, view.keypoints)
-            given = images, pictures, every, batches, view.num_matches, make_rows
-            counted.add(collect_matches(*given), poses)
+            room = make_rows((view.num_matches, 2), dtype=np.uint32)
+            counted.add(collect_matches(images, pictures, every, batches, room, 2), poses)
     return counted.compare(points)
 
 

@@ -367,3 +367,30 @@ def test_points_are_chosen_by_their_length():
     np.testing.assert_array_equal(long.points_seen >= 0, is_long)
     seen = long.points[long.points_seen[is_long]]
     np.testing.assert_array_equal(seen, found.points[found.points_seen[is_long]])
+
+
+def test_very_many_matches_are_joined_and_chosen_alike_by_any_number_of_threads():
+    rng, num_cameras, num_keypoints, num_matches = np.random.default_rng(0), 300, 3000, 600_000
+    first, steps = rng.integers(0, 7, num_matches), rng.integers(1, 7, num_matches)
+    ends = rng.integers(0, 400, num_matches) + 400 * np.stack([first, (first + steps) % 7])
+    matched = MatchedKeypoints(
+        cameras=np.arange(num_keypoints, dtype=np.int32) // 10,
+        keypoints=np.arange(num_keypoints, dtype=np.int32) % 10,
+        pixels=rng.uniform(0.0, 100.0, (num_keypoints, 2)),
+        on_plane=rng.uniform(-0.5, 0.5, (num_keypoints, 2)),
+        matches=ends.T.astype(np.uint32),
+    )
+    poses = CameraPoses(
+        rotations=np.tile(np.eye(3), (num_cameras, 1, 1)),
+        centers=rng.uniform(-1.0, 1.0, (num_cameras, 3)),
+        focal_lengths_px=np.full(num_cameras, 100.0),
+        images=np.arange(num_cameras),
+    )
+    chosen = rng.random(num_keypoints) < 0.5
+    kept = chosen[matched.matches].all(axis=1)
+    for threads in (1, 2, 3):
+        joined, among = matched.join(poses, 1e9, threads), matched.among(chosen, threads)
+        assert [rows.tolist() for rows in joined] == [list(range(k, 2800, 400)) for k in range(400)]
+        np.testing.assert_array_equal(np.flatnonzero(chosen)[among.matches], matched.matches[kept])
+        for name in ("cameras", "keypoints", "pixels", "on_plane"):
+            np.testing.assert_array_equal(getattr(among, name), getattr(matched, name)[chosen])

@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array, distinct, rows_taken
+from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array, UInt64Array, distinct, rows_taken
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.damage import Damage
 from sfm_shapefit.files.colmap.database_pairs import (
@@ -25,7 +25,12 @@ from sfm_shapefit.files.colmap.database_pairs import (
     refuse_no_features,
 )
 from sfm_shapefit.files.colmap.lenses import rays_of
-from sfm_shapefit.files.colmap.sorted_matches import MOST_MATCHES, SortedMatches
+from sfm_shapefit.files.colmap.sorted_matches import (
+    MATCH_BYTES,
+    MOST_MATCHES,
+    SortedMatches,
+    keypoints_of,
+)
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_beside, is_blob
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
@@ -35,7 +40,7 @@ PIXEL_BYTES, MOST_KEYPOINTS = 8, 10_000_000
 """Bytes of a keypoint that is kept, and keypoints of a database up to which they are: a run looks at each a
 dozen times."""
 
-_HALF = np.uint64(32)  # bits of a keypoint's number; a match is one number of two of them
+_HALF = np.uint64(32)  # bits of a keypoint; the number of a match holds two, see `sorted_matches`
 _SURVEYED = 250_000  # matches that are looked at together; as many as are read together later
 
 
@@ -180,8 +185,8 @@ class DatabaseMatches(Matches):
         if cols not in (2, 4, 6) or not is_blob(data, rows, cols, itemsize=4):
             return np.zeros((0, 2), dtype=np.float32)  # what is damaged was told when the file was opened
         xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float32)
-        is_finite = np.isfinite(xy).all(axis=1)
-        if not is_finite.all():
+        if not np.isfinite(xy).all():  # which takes a tenth of the time of a look at each keypoint
+            is_finite = np.isfinite(xy).all(axis=1)
             self._broken[name] = np.flatnonzero(~is_finite)
             xy[~is_finite] = 0.0
         return xy
@@ -193,28 +198,40 @@ class DatabaseMatches(Matches):
     def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:
         """Return the matches of pairs, from the file only if they were not read, or not to be kept."""
         if keep and self._sorted is not None:
-            return self._sorted.read(pairs, self._read_matches)
-        return self._read_matches(pairs)
+            counts, numbers = self._sorted.read(pairs, self._numbers)
+        else:
+            counts, numbers = self._numbers(pairs)
+        return counts, keypoints_of(numbers)
 
-    def _read_matches(self, chosen: IntArray) -> tuple[IntArray, UInt32Array]:
-        """Return the matches of pairs from the file, image i first, of each pair ascending and each once.
+    def _numbers(self, chosen: IntArray) -> tuple[IntArray, UInt64Array]:
+        """Return the matches of pairs (k,) from the file as numbers, of each pair ascending and each once.
 
         Sums over matches then do not depend on the order in which the database lists them. Many pairs are
         read together, since a pair has few matches, and a call of numpy takes as long as a hundred of them.
         """
-        counts = self.num_matches[chosen]
-        # A match is made one number, its first keypoint above, for numbers are sorted faster than rows.
-        both = np.frombuffer(self._stored_matches(chosen), dtype="<u8")
-        both = np.where(np.repeat(self.rows.swapped[chosen], counts), both, both >> _HALF | both << _HALF)
-        of_pair = np.repeat(np.arange(len(chosen)), counts)
-        is_same = of_pair[1:] == of_pair[:-1]
-        ends = np.cumsum(counts).tolist()
-        for pair in distinct(of_pair[1:][(both[1:] < both[:-1]) & is_same]).tolist():
-            both[ends[pair] - counts[pair] : ends[pair]].sort()
-        new = np.append(True, (both[1:] != both[:-1]) | ~is_same)[: len(both)]
-        if not new.all():
-            of_pair, both = of_pair[new], both[new]
-        matches = both.astype("<u8", copy=False).view("<u4").reshape(-1, 2)[:, ::-1]
+        counts, swapped = self.num_matches[chosen], self.rows.swapped[chosen]
+        stored = np.frombuffer(self._stored_matches(chosen), dtype="<u8")
+        numbers = stored << _HALF
+        numbers |= stored >> _HALF
+        if swapped.any():
+            numbers = np.where(np.repeat(swapped, counts), stored, numbers)
+        begins = np.cumsum(counts) - counts
+        ascends = numbers[1:] > numbers[:-1]
+        ascends[begins[1:] - 1] = True
+        if not ascends.all():
+            counts, numbers = _ascending(numbers, counts, 1 + np.flatnonzero(~ascends))
+            begins = np.cumsum(counts) - counts
+        firsts, seconds = numbers[begins + counts - 1] >> _HALF, keypoints_of(numbers)[:, 1]
+        last = np.stack([firsts, np.maximum.reduceat(seconds, begins)], axis=1)
+        if self._broken or (last >= self.num_keypoints[self.pairs[chosen]]).any():
+            return self._without_lost(chosen, counts, numbers)
+        return counts, numbers
+
+    def _without_lost(
+        self, chosen: IntArray, counts: IntArray, numbers: UInt64Array
+    ) -> tuple[IntArray, UInt64Array]:
+        """Return matches of pairs without those of keypoints that do not exist or are not finite."""
+        of_pair, matches = np.repeat(np.arange(len(chosen)), counts), keypoints_of(numbers)
         ends = self.pairs[chosen][of_pair]
         is_lost = (matches >= self.num_keypoints[ends]).any(axis=1)
         if is_lost.any():
@@ -224,17 +241,18 @@ class DatabaseMatches(Matches):
             )
         for image in map(self.names.index, self._broken):
             is_lost |= ((ends == image) & np.isin(matches, self._broken[self.names[image]])).any(axis=1)
-        if is_lost.any():
-            of_pair, matches = of_pair[~is_lost], matches[~is_lost]
-        return np.bincount(of_pair, minlength=len(chosen)), matches
+        return np.bincount(of_pair[~is_lost], minlength=len(chosen)), numbers[~is_lost]
 
     def _stored_matches(self, chosen: IntArray) -> bytes:
         """Return the matches of pairs as the file lists them, one pair after the other."""
-        stored = self.look_up(chosen, "cols, data")
-        for pair, (cols, data) in zip(chosen.tolist(), stored, strict=True):
-            if cols != 2 or not is_blob(data, int(self.num_matches[pair]), 2, itemsize=4):
-                raise self.damaged_pair(pair, "matches of wrong length")
-        return b"".join(data for _, data in stored)
+        blobs = self.file.look_up(self._table, "data", self.rows.rowids[chosen].tolist())
+        sizes = [len(data) if isinstance(data, bytes) else -1 for data in blobs]
+        wrong = np.flatnonzero(sizes != MATCH_BYTES * self.num_matches[chosen])
+        if len(wrong):
+            names = " and ".join(self.names[image] for image in self.pairs[chosen[wrong[0]]])
+            what = "has matches of wrong length; match the images again"
+            raise InputError(f"{self.file.path}: the pair {names} {what}")
+        return b"".join(blobs)
 
     def parts(self, view: View, ranges: Sequence[slice]) -> "list[DatabasePart]":
         """Return ranges of a view's pairs for other processes."""
@@ -249,14 +267,21 @@ class DatabaseMatches(Matches):
             for part in ranges
         ]
 
-    def look_up(self, pairs: IntArray, columns: str) -> list[tuple[Any, ...]]:
-        """Return columns of the two-view geometries of pairs."""
-        return self.file.look_up(self._table, columns, self.rows.rowids[pairs].tolist())
 
-    def damaged_pair(self, pair: int, what: str) -> InputError:
-        """Return the error that names a pair of images."""
-        names = " and ".join(self.names[image] for image in self.pairs[pair])
-        return InputError(f"{self.file.path}: the pair {names} has {what}; match the images again")
+def _ascending(numbers: UInt64Array, counts: IntArray, steps: IntArray) -> tuple[IntArray, UInt64Array]:
+    """Return how many matches of each pair (k,) are left, and these, ascending and each once.
+
+    Args:
+        numbers: (M,) of all pairs, which are sorted in place.
+        counts: (k,) how many each pair has.
+        steps: numbers that are not larger than the one before, which is of the same pair.
+    """
+    of_pair, ends = np.repeat(np.arange(len(counts)), counts), np.cumsum(counts)
+    for pair in distinct(of_pair[steps]).tolist():
+        numbers[ends[pair] - counts[pair] : ends[pair]].sort()
+    is_new = np.ones(len(numbers), dtype=np.bool_)
+    is_new[1:] = (numbers[1:] != numbers[:-1]) | (of_pair[1:] != of_pair[:-1])
+    return np.bincount(of_pair[is_new], minlength=len(counts)), numbers[is_new]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -21,12 +21,11 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.base.paths import refuse_irregular_file
-from sfm_shapefit.files.colmap import model_arrays
 from sfm_shapefit.files.colmap.binary_records import (
     CAMERA,
     COUNT,
@@ -419,7 +418,7 @@ def _with_points(files: ModelFiles, model: ModelArrays) -> ModelArrays:
         raise ContradictionError(f"{files.called} has no {files.beside('points3D')}")
     model = _take_points(files.open("points3D"), model)
     called = files.called_as("points3D")
-    contradiction = ""
+    contradiction, is_tracked = "", np.zeros(len(model.points2d), dtype=np.bool_)
     for heads, elements in model.point_blocks():
         is_finite = (np.abs(heads["xyz"]) <= LARGEST_COORDINATE).all(axis=1)  # false for NaN
         if not is_finite.all():
@@ -432,14 +431,16 @@ def _with_points(files: ModelFiles, model: ModelArrays) -> ModelArrays:
             image_id, keypoint = elements[~is_there][0].tolist()
             reference = f"a track refers to point {keypoint} of image {image_id}"
             raise ContradictionError(f"{called}: {reference}, which {files.beside('images')} does not have")
-        other = _observe(model, heads, model.offsets[rows] + elements[:, 1])
+        places = model.offsets[rows] + elements[:, 1]
+        other = _observe(model, heads, places)
+        is_tracked[places] |= other is None
         if other and not contradiction:
             k, point, owner = other
             reference = (
                 f"the track of 3D point {point} has keypoint {elements[k, 1]} of image {elements[k, 0]}"
             )
             contradiction = f"{called}: {reference}, to which {files.beside('images')} gives 3D point {owner}"
-    _refuse_unknown_points(files, model)
+    _refuse_unknown_points(files, model, is_tracked)
     if contradiction:
         raise ContradictionError(contradiction)
     return model
@@ -496,18 +497,17 @@ def _ascending(points: Records, tracks: UInt32Array) -> tuple[Records, UInt32Arr
     return points[order], tracks[rows]
 
 
-def _refuse_unknown_points(files: ModelFiles, model: ModelArrays) -> None:
+def _refuse_unknown_points(files: ModelFiles, model: ModelArrays, is_tracked: BoolArray) -> None:
+    """Refuse keypoints that observe points which do not exist; those in tracks (o,) are right already."""
     ids, point_ids = model.points2d["point3d_id"], np.append(model.points["id"], NO_POINT)
-    for begin in range(0, len(ids), model_arrays.AT_ONCE):
-        some = ids[begin : begin + model_arrays.AT_ONCE]
-        unknown = point_ids[np.searchsorted(point_ids, some)] != some
-        if unknown.any():
-            k = int(np.argmax(unknown))
-            image_id = model.images.ids[np.searchsorted(model.offsets, begin + k, side="right") - 1]
-            raise ContradictionError(
-                f"{files.called_as('images')}: image {image_id} observes 3D point {some[k]}, which "
-                f"{files.beside('points3D')} does not have"
-            )
+    rows = np.flatnonzero(~is_tracked & (ids != NO_POINT))
+    unknown = rows[point_ids[np.searchsorted(point_ids, ids[rows])] != ids[rows]]
+    if len(unknown):
+        image_id = model.images.ids[np.searchsorted(model.offsets, unknown[0], side="right") - 1]
+        raise ContradictionError(
+            f"{files.called_as('images')}: image {image_id} observes 3D point {ids[unknown[0]]}, which "
+            f"{files.beside('points3D')} does not have"
+        )
 
 
 @inner_kernel

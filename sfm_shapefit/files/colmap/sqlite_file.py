@@ -15,6 +15,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import Any
 from urllib.parse import quote
 
@@ -96,7 +97,7 @@ class DatabaseFile:
         Raises:
             InputError: if the file is missing, is no sqlite database, or is locked or damaged.
         """
-        self.path, self._stack = Path(path), ExitStack()
+        self.path, self._stack, self._turn = Path(path), ExitStack(), Lock()
         self.notes: list[str] = []
         """What was read otherwise than it stands in the file, a sentence each."""
         with _sqlite_errors(self.path):
@@ -112,16 +113,15 @@ class DatabaseFile:
         Raises:
             InputError: if the file is locked or damaged.
         """
-        with _sqlite_errors(self.path):
+        with self._turn, _sqlite_errors(self.path):
             return self.connection.execute(statement, values).fetchall()
 
-    def look_up(self, table: str, columns: str, rowids: Sequence[int]) -> list[tuple[Any, ...]]:
-        """Return columns of rows that a table has, in the order of their ids; errors as of `query`."""
-        found: dict[int, tuple[Any, ...]] = {}
+    def look_up(self, table: str, column: str, rowids: Sequence[int]) -> list[Any]:
+        """Return a column of rows that a table has, in the order of their ids; errors as of `query`."""
+        found = dict[int, Any]()
         for first in range(0, len(rowids), _AT_ONCE):
             some = ", ".join(map(str, rowids[first : first + _AT_ONCE]))
-            rows = self.query(f"SELECT rowid, {columns} FROM {table} WHERE rowid IN ({some})")
-            found.update((row[0], row[1:]) for row in rows)
+            found.update(self.query(f"SELECT rowid, {column} FROM {table} WHERE rowid IN ({some})"))
         return [found[rowid] for rowid in rowids]
 
     def rows(self, table: str, queries: dict[tuple[str, ...], str]) -> list[tuple[Any, ...]]:
@@ -195,7 +195,7 @@ def _readonly_connection(path: Path) -> Iterator[sqlite3.Connection]:
             in_wal_mode = _WAL_VERSION in header[18:20]
             target, mode = path, "mode=ro&immutable=1" if in_wal_mode else "mode=ro"
         uri = f"file://{quote(os.fsencode(target.absolute()))}?{mode}"
-        how: dict[str, Any] = {"isolation_level": None, "check_same_thread": False}  # one at a time uses it
+        how: dict[str, Any] = {"isolation_level": None, "check_same_thread": False}  # threads take turns
         connection = stack.enter_context(
             closing(sqlite3.connect(uri, uri=True, timeout=_LOCK_TIMEOUT_S, **how))
         )
