@@ -198,7 +198,7 @@ BENCHMARK = Benchmark(
     cases=cases,
     flags=flags,
     packages=("pycolmap", "numpy", "opencv-python-headless"),
-    quick={"places": 4, "side": 256},
+    quick={"places": 4, "side": 192},
     threads=2,
     columns={
         "images, places": "placed, of all; a place has one panorama or six faces",

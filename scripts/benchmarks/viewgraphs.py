@@ -90,7 +90,7 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
         for index, value in list(jobs)[:1] if args.quick else jobs:
             if not (args.quick or value is None or value in (args.values or usual)):
                 continue
-            for repetition in args.repetitions:
+            for repetition in args.repetitions[: 1 if args.quick else None]:
                 job = jobs[index, value]
                 family = f"{job.params['family']} {index}"
                 name = f"{split} {family} {'-' if value is None else f'{value:g}'} r{repetition}"

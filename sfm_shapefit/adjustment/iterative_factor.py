@@ -79,7 +79,7 @@ class _Part:
         given = entries.copy()
         for ridge in self.ridges:
             entries[:] = given * (1.0 + ridge)
-            if self.factor.refactor_blocks(self.edges, diagonal, off_diagonal):
+            if self.factor.refactor_blocks(diagonal, off_diagonal):
                 return
         raise UnsolvableError(UNDETERMINED)
 

@@ -200,7 +200,7 @@ class SparseFactor:
         b, is_full = self.block, self.dtype == np.float64
         self.system, diagonal = None if is_full else system, system.diagonal[:, :b, :b].copy()
         np.einsum("naa->na", diagonal)[:] *= 1.0 if is_full else 1.0 + _RIDGE
-        if self.factor.refactor_blocks(self.pair_nodes, diagonal, system.pairs[:, :b, :b]):
+        if self.factor.refactor_blocks(diagonal, system.pairs[:, :b, :b]):
             return
         if is_full:
             raise UnsolvableError(UNDETERMINED)
@@ -242,7 +242,7 @@ class SparseFactor:
         """Return the selected entries of the inverse."""
         b, out = self.block, np.zeros((*self.unknown.shape, SLOTS))
         assert self.factor is not None
-        out[:, :b, :b] = self.factor.selected_inverse(self.pair_nodes).nodes
+        out[:, :b, :b] = self.factor.selected_inverse().nodes
         return out * self.unknown[:, :, None] * self.unknown[:, None, :]
 
 

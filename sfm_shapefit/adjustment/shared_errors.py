@@ -307,9 +307,11 @@ def likeliest_variance(values: FloatArray, variances: FloatArray) -> float:
 def _windows(problem: AdjustmentProblem) -> FloatArray:
     """Return the middle and the half size of the pixels that the lens of each camera uses, (c, 4)."""
     lenses = problem.lens_of_camera[problem.cameras_seeing]
-    low, high = np.full((len(problem.lenses), 2), np.inf), np.full((len(problem.lenses), 2), -np.inf)
-    np.minimum.at(low, lenses, problem.pixels)
-    np.maximum.at(high, lenses, problem.pixels)
+    low, high = np.full((2, len(problem.lenses)), np.inf), np.full((2, len(problem.lenses)), -np.inf)
+    for axis, values in enumerate(problem.pixels.T):  # NumPy is five times as fast by columns
+        np.minimum.at(low[axis], lenses, values)
+        np.maximum.at(high[axis], lenses, values)
+    low, high = low.T, high.T
     low, high = np.where(low < high, low, -1.0), np.where(low < high, high, 1.0)
     windows = np.concatenate([0.5 * (low + high), 0.5 * (high - low)], axis=1)
     return np.ascontiguousarray(windows[problem.lens_of_camera])

@@ -103,6 +103,8 @@ class Writers(NamedTuple):
     """Writes a page of a result, and returns it."""
     folder: Callable[..., Path]
     """Writes the folder of a result, and returns it."""
+    length: Callable[..., Any]
+    """Tells how well a length in a result is known."""
 
 
 def _writers() -> Writers:
@@ -138,7 +140,21 @@ class Written(Reported):
     """Attributes that completion offers; the others are what the stages of a run left, and may change."""
 
     def __dir__(self) -> Iterable[str]:
-        return sorted({*self._PUBLIC, "facts", "report", "summary", "verdict", "write"})
+        return sorted({*self._PUBLIC, "facts", "length", "report", "summary", "verdict", "write"})
+
+    def length(self, first: str | int, second: str | int) -> Any:
+        """Return the distance of two images or points and how well it is known, see `evaluate_lengths`.
+
+            print(found.length("0001.jpg", "0004.jpg"))  # 2.503 ± 0.004 (95 %), worst direction ...
+
+        Args:
+            first, second: names of images, whose centers are meant, or ids of 3D points.
+
+        Raises:
+            InputError: if there is no such image or point, or the result has no model.
+            UnsolvableError: if nothing is known of the errors.
+        """
+        return _writers().length(self, first, second)
 
     def write(self, out: Path | str, **options: Any) -> Path:
         """Write the result into a new or empty folder, which is filled in one step, and return it.

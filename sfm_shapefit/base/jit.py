@@ -15,6 +15,7 @@ is another compilation: integers are int64 and arrays writable, or read-only, wh
 literal number has a type of its own.
 """
 
+import ctypes
 import hashlib
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -27,7 +28,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils, targetconfig
 from numba.core.event import install_listener
-from numba.extending import get_cython_function_address, intrinsic, register_jitable
+from numba.extending import intrinsic, register_jitable
 
 from sfm_shapefit.base.kernel_cache import CompileTime, KernelCache, choose_target
 from sfm_shapefit.base.scipy_parts import compiled_module
@@ -54,6 +55,12 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 # Functions of numpy that make an array, as far as kernels call them; numba refuses another in a kernel that
 # calls none of these.
 _MAKE_ARRAYS = {"arange", "array", "empty", "empty_like", "full", "ones", "zeros"}
+
+# What Python offers to read what a Cython module exports.
+_name_of = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", ctypes.pythonapi))
+_pointer_in = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
+    ("PyCapsule_GetPointer", ctypes.pythonapi)
+)
 
 # Four float64 or eight float32: what most processors add at once.
 _LANE_BYTES = 32
@@ -96,8 +103,8 @@ def function_address(module: str, name: str) -> int:
         module: such as "scipy.linalg.cython_blas".
         name: such as "dsyrk".
     """
-    compiled_module(*module.rsplit(".", 1))  # alone; numba would load its package too
-    return int(get_cython_function_address(module, name))
+    capsule = compiled_module(*module.rsplit(".", 1)).__pyx_capi__[name]  # numba would import all of scipy
+    return int(_pointer_in(capsule, _name_of(capsule)))
 
 
 def _call_address(_context: Any, address: Any, pointers: Any) -> Any:
@@ -134,36 +141,32 @@ array_address = intrinsic(_array_address)
 
 
 def _multiply_in_lanes(
-    _context: Any, panel: Any, _at: Any, _leading: Any, vectors: Any, _start: Any, _count: Any, sums: Any
+    _context: Any, panel: Any, _at: Any, _leading: Any, vector: Any, _start: Any, _count: Any, sums: Any
 ) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         integer = context.get_value_type(types.int64)
         number = context.get_value_type(signature.args[0].dtype)
         size = context.get_abi_sizeof(number)
         lanes = ir.VectorType(number, _LANE_BYTES // size)
-        flat, lines, out = (
+        flat, line, out = (
             context.make_array(signature.args[k])(context, builder, arguments[k]) for k in (0, 3, 6)
         )
         _, at, leading, _, start, count, _ = arguments
-        length = builder.extract_value(lines.shape, 1)
-
-        def place(data: Any, first: Any, stride: Any, k: int) -> Any:
-            return builder.gep(data, [builder.add(first, builder.mul(stride, integer(k)))])
-
-        columns = [place(flat.data, at, leading, q) for q in range(4)]
-        rows = [place(lines.data, start, length, k) for k in range(3)]
+        starts = (builder.add(at, builder.mul(leading, integer(q))) for q in range(4))
+        columns = [builder.gep(flat.data, [first]) for first in starts]
+        row = builder.gep(line.data, [start])
 
         def accumulate(begin: Any, end: Any, kind: Any, step: int) -> list[Any]:
-            totals = [cgutils.alloca_once_value(builder, ir.Constant(kind, None)) for _ in range(12)]
+            totals = [cgutils.alloca_once_value(builder, ir.Constant(kind, None)) for _ in columns]
             with cgutils.for_range_slice(builder, begin, end, integer(step), integer) as (i, _):
 
                 def load(pointer: Any) -> Any:
                     here = builder.bitcast(builder.gep(pointer, [i]), kind.as_pointer())
                     return builder.load(here, align=size)
 
-                factors, values = [load(column) for column in columns], [load(row) for row in rows]
-                products = [builder.fmul(factor, value) for value in values for factor in factors]
-                for total, product in zip(totals, products, strict=True):
+                value = load(row)
+                for total, column in zip(totals, columns, strict=True):
+                    product = builder.fmul(load(column), value)
                     builder.store(builder.fadd(builder.load(total), product), total)
             return [builder.load(total) for total in totals]
 
@@ -181,13 +184,13 @@ def _multiply_in_lanes(
         whole = builder.sub(count, builder.srem(count, integer(lanes.count)))
         vectorial = accumulate(integer(0), whole, lanes, lanes.count)
         rest = accumulate(whole, count, number, 1)
-        for k in range(12):
+        for k in range(4):
             total = builder.fadd(add_lanes(vectorial[k]), rest[k])
             builder.store(total, builder.gep(out.data, [integer(k)]))
         return context.get_dummy_value()
 
     number = types.int64
-    return types.void(panel, number, number, vectors, number, number, sums), generate
+    return types.void(panel, number, number, vector, number, number, sums), generate
 
 
 def _subtract_block(_context: Any, spread: Any, rows: Any, _row: Any, blocks: Any, _block: Any) -> Any:
@@ -227,12 +230,12 @@ def _indices(numbers: Iterable[int]) -> ir.Constant:
 
 
 multiply_in_lanes = intrinsic(_multiply_in_lanes)
-"""In a kernel: the products of four columns with three vectors, summed in lanes of a fixed width.
+"""In a kernel: the products of four columns with a vector, summed in lanes of a fixed width.
 
-`multiply_in_lanes(panel, at, leading, vectors, start, count, sums)` writes to sums[k, q] the sum over i <
-count of panel[at + q leading + i] vectors[k, start + i]. A sum in the written order cannot use the vectors of
-a processor. These sums do, and have one order on all of them. `panel` (.,), `vectors` (3, .) and `sums` (3,
-4) are contiguous and of one type, float32 or float64.
+`multiply_in_lanes(panel, at, leading, vector, start, count, sums)` writes to sums[q] the sum over i < count
+of panel[at + q leading + i] vector[start + i]. A sum in the written order cannot use the vectors of a
+processor. These sums do, and have one order on all of them. `panel` (.,), `vector` (.,) and `sums` (4,) are
+contiguous and of one type, float32 or float64.
 """
 
 

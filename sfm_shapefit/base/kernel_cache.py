@@ -48,7 +48,7 @@ RUNTIME = f"py{sys.version_info[0]}{sys.version_info[1]}-numba{'.'.join(numba.__
 """What machine code and its wrapping are made for, beside the processor."""
 
 _X86_64_V3 = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
-_IMPORT = re.compile(rb"^\s*(?:from|import) (sfm_shapefit[\w.]*)", re.MULTILINE)
+_IMPORT = re.compile(rb"from (sfm_shapefit[\w.]*) import ")
 
 _missed: list[Callable[[], None]] = []
 """What is called when a kernel is not found, once, before it is looked for again."""
@@ -206,7 +206,7 @@ class KernelCache(NullCache):  # type: ignore[misc]
     def _file_name(self, signature: Any, codegen: Any) -> str:
         """Return the name of the file for a signature and a processor; none without a source."""
         stamp = stamp_of(self._source)
-        what = repr((signature, codegen.magic_tuple(), self._code))
+        what = repr((signature, _processor(codegen), self._code))
         return stamp and f"{self._prefix}{stamp}-{hashlib.sha256(what.encode()).hexdigest()[:16]}.nbc"
 
     def _find(self, name: str, target_context: Any) -> Any:
@@ -248,9 +248,14 @@ def shipped_folders(source_folder: Path) -> list[Path]:
 
 def own_folders(source_folder: Path) -> list[Path]:
     """Return where the kernels of a folder of sources may be written, the first choice first."""
+    return _own_folders(source_folder, config.CACHE_DIR)
+
+
+@cache
+def _own_folders(source_folder: Path, chosen: str) -> list[Path]:
     place = f"{source_folder.name}_{hashlib.sha256(str(source_folder).encode()).hexdigest()[:16]}"
-    if config.CACHE_DIR:
-        return [Path(config.CACHE_DIR) / place]
+    if chosen:
+        return [Path(chosen) / place]
     user = Path(AppDirs(appname="sfm_shapefit", appauthor=False).user_cache_dir)
     return [source_folder / "__pycache__", user / place]
 
@@ -322,6 +327,12 @@ def _source_of(module: str) -> Path:
     """Return the file of a module of this package, which hundreds of imports name."""
     place = PACKAGE.joinpath(*module.split(".")[1:])
     return place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+
+
+@cache
+def _processor(codegen: Any) -> tuple[str, ...]:
+    """Return what numba says of the processor that it compiles for."""
+    return tuple(map(str, codegen.magic_tuple()))
 
 
 @cache

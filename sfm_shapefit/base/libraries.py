@@ -1,12 +1,32 @@
-"""Compiled libraries that a thread loads into the process while others import modules."""
+"""The large packages that most commands need, brought into the process of the program in less time."""
 
 import ctypes
 import os
+import sys
 from contextlib import suppress
+from importlib import import_module
 from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Thread
+
+_ASKED_FOR_BY_NUMBA = ("scipy", "yaml")
+"""Packages that numba imports to see the version of one, and to read a file of settings with the other."""
+
+
+def import_packages() -> None:
+    """Import numba while a thread loads pycolmap's library, a tenth of what all imports take.
+
+    numba is told that scipy and PyYAML are absent, which it takes longer to import than to do without.
+    """
+    load_ahead("pycolmap")
+    hidden = [name for name in _ASKED_FOR_BY_NUMBA if name not in sys.modules]
+    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]  # None: cannot be imported
+    try:
+        import_module("numba")
+    finally:
+        for name in hidden:
+            del sys.modules[name]
 
 
 def load_ahead(package: str) -> None:

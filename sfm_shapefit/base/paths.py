@@ -57,6 +57,11 @@ def refuse_no_folder(
         raise InputError(f"{folder} is no folder; give {wanted}")
 
 
+def from_here(path: str) -> str:
+    """Return a path as it is typed in the working folder."""
+    return path.removeprefix(f"{Path.cwd()}/")
+
+
 def file_of(folder: Path, name: str) -> Path | None:
     """Return the file of an image, if there is one inside the folder."""
     try:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.libraries import import_packages
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
     print_answer,
@@ -102,6 +103,7 @@ def check_command(
                 _be_strict(is_usable=bool(pieces.kept), has_matches=pieces.has_matches)
             return
         refuse_no_model(source)
+        import_packages()
         from sfm_shapefit.base.atomic_folder import claimed_output
         from sfm_shapefit.commands.check import check
         from sfm_shapefit.files.colmap.listed_poses import read_source

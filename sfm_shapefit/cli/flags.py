@@ -3,6 +3,7 @@
 import inspect
 import itertools
 import re
+import shlex
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -96,6 +97,8 @@ _METAVARS: dict[Any, str] = {
 }
 """Placeholder of a flag's value in the help, by the field's name or else by its type."""
 
+_ASKED_OF_MODELS = {"control_points", "length"}
+"""Flags of `evaluate` that ask a finished model, as `check` does."""
 _REPEATED = {"known_distance": (str, str, float), "length": (str, str)}
 """Repeatable flags of several values, which typer has no way to declare, and the types of these values."""
 
@@ -216,7 +219,13 @@ class GroupedCommand(TyperCommand):
             if name in key_names:
                 ctx.fail(f"{flag} is a key of --config: {name} = ...")
             if others := _commands_with(name):
-                ctx.fail(f"{flag} is an option of {others}")
+                is_asked = ctx.info_name == "check" and name in _ASKED_OF_MODELS
+                how = (
+                    f": sfm-shapefit evaluate {shlex.join(args).replace(flag, _flag_of(name))}"
+                    if is_asked
+                    else ""
+                )
+                ctx.fail(f"{flag} is an option of {others}{how}")
             if answer := answer_for(flag, known | key_names):
                 ctx.fail(answer)
 
@@ -440,10 +449,18 @@ def _describe_unknown(name: str, known: Sequence[str]) -> str:
 
 
 def _commands_with(name: str) -> str:
+    """Return the commands that have an option as a flag or a key; empty if none has."""
+    from sfm_shapefit.cli.root import app, load_commands
     from sfm_shapefit.facts.command_options import InspectOptions, JoinOptions, LocateOptions, MapOptions
 
     kinds = {"locate": LocateOptions, "map": MapOptions, "join": JoinOptions, "inspect": InspectOptions}
-    return " and ".join(command for command, kind in kinds.items() if name in homes_of(kind))
+    having = [command for command, kind in kinds.items() if name in homes_of(kind)]
+    load_commands()
+    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    for command, shown in commands.items():
+        is_known = any(_flag_of(name) in one.opts for one in shown.params) and not shown.hidden
+        having += [command] * (is_known and command not in having)
+    return " and ".join(filter(None, [", ".join(having[:-1]), *having[-1:]]))
 
 
 def one_path(positional: Path | None, flag: Path | None, name: str) -> Path:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Generic
 import typer
 
 from sfm_shapefit.base.display import row
+from sfm_shapefit.base.libraries import import_packages
 from sfm_shapefit.base.paths import OF_DATABASE, SOLVED
 from sfm_shapefit.base.settings import S, flat_values
 from sfm_shapefit.base.wording import first_of
@@ -189,6 +190,7 @@ def command_run(
         kept = () if begun is None else MADE_FIRST
         plan = PLANS.get(order if begun is None else "IMAGES OUT", ())
         with claimed_output(target, overwrite=flags.overwrite, protect=run.protect, kept=kept):
+            import_packages()
             from sfm_shapefit.base.kernel_cache import measure_compilation
             from sfm_shapefit.files.colmap.quiet import hear_pycolmap
 

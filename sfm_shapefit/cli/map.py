@@ -121,7 +121,7 @@ def _match(
     begun, notes = begin_database(images, database, read_options(MatchingOptions, given), clock)
     with closing(DatabaseFile(database)) as file:  # what cannot be used is refused before the long work
         _, _, known = read_beside(file, read_images(file).images, run.options, priors)
-    match_begun(begun, clock)
+    match_begun(begun, clock, priors)
     run.flags = replace(run.flags, images=run.flags.images or str(images))
     return known, notes
 

@@ -12,7 +12,6 @@ import typer
 from typer.core import TyperGroup
 
 from sfm_shapefit import __version__
-from sfm_shapefit.base.libraries import load_ahead
 from sfm_shapefit.cli.colmap_names import answer_for_command
 from sfm_shapefit.cli.console import (
     EXIT_INTERRUPTED,
@@ -31,12 +30,9 @@ _GROUPS = {
 }
 """The commands in the help, the most used first."""
 
-_READING = ("map", "locate", "join", "check")
-"""Commands that load pycolmap, whatever they are given."""
-
 # New objects after which unused ones are looked for. Modules make a hundred thousand that stay; to go through
-# them as often as the interpreter does by itself takes a twentieth of a short run.
-_OBJECTS_BETWEEN_SEARCHES = (50_000, 20, 100)
+# them as often as the interpreter does by itself takes a twentieth of a short run, and even once a hundredth.
+_OBJECTS_BETWEEN_SEARCHES = (150_000, 10, 100)
 
 
 _PLAIN: dict[Any, Any] = {str: str, Path: Path, int: int, float: float, int | None: int, float | None: float}
@@ -129,8 +125,6 @@ def load_commands(words: Sequence[str] = ()) -> None:
     """
     known = [name for names in _GROUPS.values() for name in names]
     called = next((word for word in words if not word.startswith("-")), None)
-    if called in _READING and not {"-h", "--help"}.intersection(words):
-        load_ahead("pycolmap")  # a tenth of what all imports take, on another core
     for name in [called] if called in known else known:
         import_module(f"sfm_shapefit.cli.{name.replace('-', '_')}")
 

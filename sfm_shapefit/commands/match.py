@@ -3,32 +3,38 @@
 images and lenses -> features -> pairs -> matches and two-view geometries
 """
 
-import json
 import warnings
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.paths import MASKS, refuse_no_folder
-from sfm_shapefit.base.record import write_json
-from sfm_shapefit.base.settings import flat_values, merge_options
+from sfm_shapefit.base.paths import MASKS, OF_DATABASE, refuse_no_folder
+from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.base.wording import first_of
+from sfm_shapefit.files.colmap.database_images import read_images
+from sfm_shapefit.files.colmap.known import read_priors
 from sfm_shapefit.files.colmap.photographs import (
     PhotographDatabase,
     find_photographs,
     refuse_lens,
     refuse_rigs,
+    remember_options,
 )
 from sfm_shapefit.files.colmap.picture_matches import read_descriptors
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.matching_options import MATCHING_FILE, MOST_EXHAUSTIVE, MatchingOptions
-from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, alike_pairs
+from sfm_shapefit.judgement.chosen_pairs import NEAR_A_STEP, NUM_DESCRIBED, alike_pairs, nearest_pairs
 from sfm_shapefit.scene.sequences import find_sequences
 from sfm_shapefit.solver.solver_options import SolverOptions
 
-_ALIKE, _ALIKE_OF_SEQUENCE = 30, 5
-"""Alike images that each is matched with: as many as COLMAP's retrieval would be asked for, or, where those
-next in a sequence are matched too, what closes its loops."""
+_ALIKE, _ALIKE_BESIDE = 30, 5
+"""Alike images that each is matched with: as many as COLMAP's retrieval would be asked for, or what closes
+loops beside images next in a sequence or near in position."""
 
 
 def match_images(
@@ -36,6 +42,7 @@ def match_images(
     database: Path | str,
     *,
     options: MatchingOptions | None = None,
+    priors: Path | str | None = None,
     threads: int = 0,
     progress: Progress | None = None,
     **overrides: Any,
@@ -50,6 +57,8 @@ def match_images(
         database: file to be made. One that an interrupted call left is gone on with, and so is one to which
             images are added.
         options: settings, see `help(MatchingOptions)`; defaults if None.
+        priors: a table of positions, or a folder with EXIF data, for `pairing="spatial"`; without it, the
+            EXIF data of the images.
         threads: 0 for all cores.
         progress: called as stages advance.
         **overrides: single options by name: `match_images(images, database, pairing="sequential")`.
@@ -66,7 +75,7 @@ def match_images(
     options = merge_options(options, MatchingOptions, overrides)
     clock = Clock.of(progress, SolverOptions(threads=threads).threads)
     made, notes = begin_database(Path(images), Path(database), options, clock)
-    match_begun(made, clock)
+    match_begun(made, clock, priors)
     for note in notes:
         warnings.warn(note, stacklevel=2)
     return Path(database)
@@ -75,10 +84,7 @@ def match_images(
 def begin_database(
     folder: Path, path: Path, options: MatchingOptions, clock: Clock
 ) -> tuple[PhotographDatabase, list[str]]:
-    """Make a database of photographs with images and lenses, and say what the user should know, in sentences.
-
-    Errors are those of `match_images`.
-    """
+    """Make a database with images and lenses; return it, and notes; errors as of `match_images`."""
     refuse_lens(options)
     if options.mask_path:
         refuse_no_folder(Path(options.mask_path), MASKS)
@@ -88,47 +94,39 @@ def begin_database(
         folder=folder, database=path, names=found.names, options=options, threads=clock.threads
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    _remember(path, options)
+    remember_options(path, options)
     with clock("images"):
         unreadable = made.write_images(clock.advance)
         names = made.known_names()
     if len(names) < 2:
         path.unlink()
-        _record_of(path).unlink()
+        path.with_name(MATCHING_FILE).unlink()
         raise InputError(f"{folder} has no two images that pycolmap can read; not {first_of(unreadable)}")
     unused = [*found.unread, *unreadable]
     why = "not used, since pycolmap cannot read them"
     return made, [f"{why}: {first_of(unused)} in {folder}"] if unused else []
 
 
-def match_begun(made: PhotographDatabase, clock: Clock) -> None:
-    """Write the features and matches that a database of photographs lacks."""
+def match_begun(made: PhotographDatabase, clock: Clock, priors: Path | str | None = None) -> None:
+    """Write the features and matches that a database of photographs lacks; `priors` as of `match_images`."""
+    pairing = _pairing_of(made.known_names(), made.options)
+    near = _near_pairs(made, priors or OF_DATABASE) if pairing == "spatial" else None
     with clock("features"):
         made.detect(clock.advance)
     with clock("matches"):
-        _match(made, _pairing_of(made.known_names(), made.options), clock)
+        if near is not None:
+            made.match_pairs(near, clock.advance)
+        _match(made, pairing, clock)
 
 
-def _record_of(database: Path) -> Path:
-    return database.with_name(MATCHING_FILE)
-
-
-def _remember(database: Path, options: MatchingOptions) -> None:
-    """Write with which options a database is made; InputError if it was begun with others or elsewhere."""
-    record, told = _record_of(database), flat_values(options)
-    if not database.exists():
-        return write_json(told, record)
-    try:
-        before = json.loads(record.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise InputError(
-            f"{database} was not made of images by this program; map it as it is, or choose another place"
-        ) from None
-    if others := [f"{name}={before.get(name)!r}" for name in told if before.get(name) != told[name]]:
-        raise InputError(
-            f"{database} was begun with {', '.join(others)}; give the same options, or another place"
-        )
-    return None
+def _near_pairs(made: PhotographDatabase, priors: Path | str) -> IntArray:
+    """Return the pairs (k, 2) of each image and those nearest to it, as rows of the names of the database."""
+    with closing(DatabaseFile(made.database)) as file:
+        images = read_images(file).images
+        known = read_priors(images, file, priors).known
+    row_of = {name: row for row, name in enumerate(made.known_names())}
+    rows = np.array([row_of[name] for name in images.names_of(known.indices)])
+    return np.sort(rows[nearest_pairs(known.positions, NEAR_A_STEP * made.options.overlap)], axis=1)
 
 
 def _pairing_of(names: list[str], options: MatchingOptions) -> str:
@@ -141,10 +139,10 @@ def _pairing_of(names: list[str], options: MatchingOptions) -> str:
 
 
 def _match(made: PhotographDatabase, pairing: str, clock: Clock) -> None:
-    """Match the pairs of a kind, and those of a sequence that close its loops."""
+    """Match all pairs, or those of a sequence, and those that look alike."""
     if pairing == "exhaustive":
         return made.match_exhaustively(clock.advance)
     if pairing == "sequential":
         made.match_sequentially(clock.advance)
-    most = _ALIKE_OF_SEQUENCE if pairing == "sequential" else _ALIKE
+    most = _ALIKE if pairing == "retrieval" else _ALIKE_BESIDE
     return made.match_pairs(alike_pairs(read_descriptors(made.database, NUM_DESCRIBED), most), clock.advance)

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_file, atomic_folder
 from sfm_shapefit.base.display import Reported, Writers
-from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
 from sfm_shapefit.commands.colors import Result, with_colors
@@ -159,5 +159,14 @@ def _write_report(found: Any, page: Path, images: Path | str, out: str = "OUT") 
     return write_result_page(found, page, images, out)
 
 
-WRITERS = Writers(_draw_page, write_page, write_result)
+def _length_of(found: Any, first: str | int, second: str | int) -> Any:
+    from sfm_shapefit.commands.lengths import evaluate_lengths  # here: few ask
+
+    told = evaluate_lengths(found, [(first, second)])
+    if not told.lengths:
+        raise UnsolvableError(told.warnings[-1])
+    return told.lengths[0].length
+
+
+WRITERS = Writers(_draw_page, write_page, write_result, _length_of)
 """What `base.display` writes results by."""

@@ -76,6 +76,9 @@ class LengthFacts(Record):
         within, digits = within_95(self.length, self.half_width), digits_of(self.half_width)
         return f"{within}, worst direction {along} (± {self.worst_half_width:.{digits}f})"
 
+    def __str__(self) -> str:
+        return self.interval
+
     def said(self, half_width: float) -> str:
         """Return half an interval in two digits, of meters in the unit that suits it."""
         is_metric = self.unit == "m"

@@ -135,7 +135,7 @@ class MapResult(Written, Tabled):
         """What is told of the run: each figure of map.json."""
         return MapFacts.taken_from(
             self,
-            inputs=DatabaseInputs(database=str(self.database)),
+            inputs=DatabaseInputs(database=str(self.database.absolute())),
             options=flat_values(self.options),
             models=[
                 Component(

@@ -7,7 +7,6 @@ what people are to see of it is one more line in `scene_rows` (terminal, report 
 import math
 import shlex
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from sfm_shapefit.adjustment.estimate import BundleAdjustment, Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, distinct
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
+from sfm_shapefit.base.paths import from_here
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, in_pixels, rounded
 from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
@@ -51,19 +51,24 @@ from sfm_shapefit.scene.lens import LensErrors
 class ModelInputs(InputFacts):
     """What a model was made of."""
 
-    model: Annotated[str, "The model's folder or file."]
-    database: Annotated[str | None, "The database whose matches were used, if any."]
+    model: Annotated[str, "The model's folder or file, from the root on."]
+    database: Annotated[str | None, "The database whose matches were used, if any, from the root on."]
     directions: Annotated[str, "Where the directions came from."]
 
     @property
     def path(self) -> str:
-        """Path of the model; one in memory, as of `map`, is named by its database."""
-        return self.database if self.model == IN_MEMORY and self.database else self.model
+        """Path of the model as it is typed here; one in memory, as of `map`, is named by its database."""
+        return from_here((self.model == IN_MEMORY and self.database) or self.model)
+
+    @property
+    def typed_database(self) -> str:
+        """The database as it is typed in a command here; empty without one."""
+        return shlex.quote(from_here(self.database)) if self.database else ""
 
     @property
     def database_flag(self) -> str:
         """How a command is given the database, after a space; empty without one."""
-        return f" --database {shlex.quote(_from_here(self.database))}" if self.database else ""
+        return f" --database {self.typed_database}" if self.database else ""
 
 
 class PlacementAdjustment(Record):
@@ -171,7 +176,7 @@ class FactsOfModel(Facts):
         """Return the answer in lines: how many pairs are `against` it, of how many, and `more` of matches."""
         error_px = self.mean_reprojection_error_px
         points = f", mean reprojection error {in_pixels(error_px, 2)}" if error_px is not None else ""
-        source = _from_here(self.inputs.database) if self.inputs.database else self.inputs.directions
+        source = from_here(self.inputs.database) if self.inputs.database else self.inputs.directions
         contradict = (
             f"{against[0]:,} of {counted(against[1], 'pair')} contradict{'s' * (against[1] == 1)} the result"
         )
@@ -247,7 +252,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         """What to do next."""
         if self.verdict.doubts_database:
             text = "Next: place it by the database that it was made from."
-            model, sigma_deg = shlex.quote(self.inputs.model), self.options["rotations"]
+            model, sigma_deg = shlex.quote(self.inputs.path), self.options["rotations"]
             by = f"--database ITS_DATABASE --rotations {sigma_deg:g}"
             return NextStep(text, f"sfm-shapefit locate {model} {{out}} --overwrite {by}")
         return next_of_model(self.verdict.grade, self)
@@ -322,7 +327,7 @@ def next_of_model(grade: Grade, facts: FactsOfModel) -> NextStep:
         step = f"sfm-shapefit inspect {{out}}{inputs.database_flag}"
         return NextStep("Next: find out what is wrong with the input.", step)
     if grade is Grade.DO_NOT_USE:
-        matches = shlex.quote(_from_here(inputs.database)) if inputs.database else "{images}"
+        matches = inputs.typed_database or "{images}"
         text = "Next: make a model from the matches alone, without the poses of the input."
         return NextStep(text, f"sfm-shapefit map {matches} mapped")
     looked = "once you have looked" if grade is Grade.LOOK else ""
@@ -333,11 +338,6 @@ def next_of_model(grade: Grade, facts: FactsOfModel) -> NextStep:
 def _next_in(folder: str, grade: Grade, facts: FactsOfModel) -> NextStep:
     """Return what to do with a model that was only looked at, in its folder."""
     return next_of_model(grade, facts).at(out=folder, out_dense="dense")
-
-
-def _from_here(path: str) -> str:
-    """Return a path as it is typed in the working folder."""
-    return path.removeprefix(f"{Path.cwd()}/")
 
 
 class CheckedFacts(FactsOfModel):
@@ -361,7 +361,7 @@ class CheckedFacts(FactsOfModel):
     @property
     def next_step(self) -> NextStep:
         """What to do next, with the folder of the pictures where it is known."""
-        return self._next().at(images=_from_here(self.images) if self.images else "IMAGES")
+        return self._next().at(images=from_here(self.images) if self.images else "IMAGES")
 
     def _next(self) -> NextStep:
         """Return what to do next, by the verdict and by what was asked."""
@@ -395,7 +395,7 @@ class CheckedFacts(FactsOfModel):
         """Return how to get more evidence: from photographs, or from all pairs of them if asked."""
         if self.inputs.database:
             text = "Next: make a model of all images of the database."
-            return NextStep(text, f"sfm-shapefit map {shlex.quote(_from_here(self.inputs.database))} mapped")
+            return NextStep(text, f"sfm-shapefit map {self.inputs.typed_database} mapped")
         if self.images:
             text = "Next: match all its photographs, and place them anew."
             return NextStep(text, "sfm-shapefit map {images} mapped")
@@ -408,7 +408,7 @@ class CheckedFacts(FactsOfModel):
         if self.second_opinion:
             step = _next_in(f"{self.second_opinion}/{second.folder}", second.grade, self)
             return step._replace(text=f"Next: take the model that map made of the database{why}.")
-        command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
+        command = f"sfm-shapefit map {self.inputs.typed_database} mapped"
         return NextStep(f"Next: take the model that map makes of the database{why}.", command)
 
     def _next_of_lenses(self, path: str) -> NextStep:
@@ -439,7 +439,7 @@ class JoinedFacts(CheckedFacts):
     """locate.json of joined models, those of `map` in joined_0: looked at, not placed anew."""
 
     options: Options
-    models: Annotated[list[str], "The folders of the models in it."]
+    models: Annotated[list[str], "The models in it, as they were given."]
     joins: Annotated[list[JoinFacts], "How they were joined."]
     scale_sigma: Annotated[float | None, "Relative standard deviation of the scale; null if not known."]
     known_distances: Annotated[
@@ -460,7 +460,7 @@ class JoinedFacts(CheckedFacts):
 class DatabaseInputs(Record):
     """What `map` worked from."""
 
-    database: Annotated[str, "The database's path."]
+    database: Annotated[str, "The database's path, from the root on."]
 
 
 class Component(Record):

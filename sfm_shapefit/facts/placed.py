@@ -18,6 +18,7 @@ from sfm_shapefit import __version__
 from sfm_shapefit.base.arrays import FloatArray, quantile
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.geometry import extent_of, fit_similarity_l1, median_spread
+from sfm_shapefit.base.paths import from_here
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, in_unit, rounded
 from sfm_shapefit.facts.tables import CameraRow, Table
@@ -382,13 +383,13 @@ def residuals_deg(placement: Judged) -> dict[str, float]:
 class GraphInputs(InputFacts):
     """What `place` worked from."""
 
-    graph: Annotated[str, "The file or folder of the graph."]
+    graph: Annotated[str, "The file or folder of the graph, from the root on."]
     directions: Annotated[str, "As given, or from which rotations."]
 
     @property
     def path(self) -> str:
-        """Path of the graph."""
-        return self.graph
+        """Path of the graph as it is typed here."""
+        return from_here(self.graph)
 
 
 class GraphFacts(PlacedFacts):

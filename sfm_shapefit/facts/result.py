@@ -121,8 +121,8 @@ class Inputs:
     def facts(self) -> ModelInputs:
         """What is told of them."""
         return ModelInputs(
-            model=str(self.folder or IN_MEMORY),
-            database=None if self.database is None or self.is_made else str(self.database),
+            model=IN_MEMORY if self.folder is None else str(self.folder.absolute()),
+            database=None if self.database is None or self.is_made else str(self.database.absolute()),
             directions=self.statement,
         )
 
@@ -503,7 +503,7 @@ class GraphResult(_Placed):
             options=flat_values(self.options),
             delivered=Delivered.compare(placement, placement.locations, adjusted=False),
             warnings=list(self.warnings),
-            inputs=GraphInputs(graph=str(self.path), directions=self.statement),
+            inputs=GraphInputs(graph=str(self.path.absolute()), directions=self.statement),
             dimension=placement.graph.dimension,
         )
 

@@ -258,8 +258,9 @@ def model_options(model: Any) -> dict[str, Any]:
 
 def told_of(model: Any, name: str, read: Callable[[Any], Any]) -> Any:
     """Return a figure of a result, or that in locate.json beside a model, read as it stands there."""
-    if not isinstance(model, Path | str):
-        return getattr(getattr(model, "facts", None), name, None)
+    if not isinstance(model, Path | str):  # the largest model of `map` stands for all
+        every = (getattr(one, "facts", None) for one in (*getattr(model, "models", ()), model))
+        return next((getattr(facts, name) for facts in every if hasattr(facts, name)), None)
     file = Path(model) / MARKER
     if not file.is_file():
         return None

@@ -6,7 +6,7 @@ from typing import Literal
 from sfm_shapefit.base.settings import Settings, explained, option
 
 CameraMode = Literal["auto", "single", "per-folder", "per-image"]
-Pairing = Literal["auto", "exhaustive", "sequential", "retrieval"]
+Pairing = Literal["auto", "exhaustive", "sequential", "spatial", "retrieval"]
 
 MATCHING_FILE = "matching.json"
 """Beside a database made of photographs: the options with which it was made, with which it is gone on."""
@@ -44,10 +44,15 @@ class MatchingOptions(Settings):
     pairing: Pairing = option(
         "auto",
         'Which pairs are matched: "exhaustive", all; "sequential", images near each other in the order of '
-        'their names, and those that look alike; "retrieval", those that look alike; "auto", all of up to '
+        'their names, or "spatial", by GPS in EXIF data or priors, and those that look alike; "retrieval", '
+        'those that look alike; "auto", all of up to '
         f"{MOST_EXHAUSTIVE} images, else sequential if their names are numbered, else by retrieval.",
     )
-    overlap: int = option(10, "Images after each one that sequential pairing matches it with.")
+    overlap: int = option(
+        10,
+        "Images after each one that sequential pairing matches it with; spatial pairing takes the nearest "
+        "ones, three times as many.",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -73,8 +73,8 @@ class MeasuredGraph:
     @property
     def is_pair(self) -> BoolArray:
         """(m,) whether an edge joins two cameras; the others join a camera and a point."""
-        first, second = self.num_cameras > self.graph.edges.T
-        return np.asarray(first & second)
+        inside = self.graph.edges < self.num_cameras
+        return np.asarray(inside[:, 0] & inside[:, 1])
 
     @property
     def pairs(self) -> IntArray:

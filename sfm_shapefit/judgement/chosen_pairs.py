@@ -27,6 +27,9 @@ from sfm_shapefit.scene.images import Images
 
 NUM_DESCRIBED = 400
 """Descriptors of a picture that describe it; a tenth of those it has, so that comparing costs little."""
+NEAR_A_STEP = 3
+"""Images near in position for each image next in a sequence: thirty reach the next strip of a flight whose
+images along one overlap by 90 % and across by 60 %."""
 _NEIGHBORS, _SHARED, _UNSHARED, _ALIKE = 6, 3, 3, 4  # pairs of an image by reason; 16 fit into 5 min of 100
 _FEW_IMAGES = 25  # images all of whose pairs are asked: a dozen each
 _NEAR, _LOOKED_AT = 12, 20  # images near in pose, and alike ones, that are looked at; more are never chosen
@@ -98,6 +101,19 @@ def alike_pairs(descriptors: Sequence[IntArray], most: int) -> IntArray:
         return np.zeros((0, 2), dtype=np.int64)
     pairs = _most_alike(_signatures([descriptors[k] for k in asked.tolist()]), most).pairs()
     return asked[distinct_pairs(np.sort(pairs, axis=1))]
+
+
+def nearest_pairs(positions: FloatArray, most: int) -> IntArray:
+    """Return the pairs (k, 2), i < j, of each position (n, 3) and the `most` nearest to it.
+
+    Heights have no part, since those of GPS are off by tens of meters.
+    """
+    from scipy.spatial import KDTree
+
+    places = positions[:, :2]
+    near = np.asarray(KDTree(places).query(places, np.arange(1, min(most + 1, len(places)) + 1))[1])
+    pairs = np.column_stack([np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()])
+    return distinct_pairs(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1))
 
 
 class _Ranked(NamedTuple):

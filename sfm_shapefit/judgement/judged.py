@@ -19,6 +19,7 @@ from sfm_shapefit.placement.second_configuration import (
 )
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.lens import LensErrors
+from sfm_shapefit.solver.splitting.linear import Resources
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -91,7 +92,7 @@ def judge(placement: Placement, options: PlacementOptions) -> Judged:
         part,
         placement.refined.locations,
         undetermined_nodes=undetermined,
-        max_bytes=options.solver.factor_bytes,
+        resources=Resources.of(options.solver),
         agreement=agreement,
     )
     is_bare = part.evidence is None  # what matches say of a model says more of folds

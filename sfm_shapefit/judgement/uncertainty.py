@@ -42,9 +42,10 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import distances_in_spreads, median_spread
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.judgement.limits import LOCAL_SHARE
-from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES, Factor, FactorPlan, analyze, factorize
+from sfm_shapefit.laplacian.factor import Factor, FactorPlan, analyze, factorize
 from sfm_shapefit.laplacian.selected import SelectedInverse, regauged
 from sfm_shapefit.solver.program import adjoint, differences
+from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources
 
 # Shares of each block's trace, added in turn; loose nodes become large, finite.
 _RIDGES = (1e-12, 1e-10, 1e-8)
@@ -120,11 +121,11 @@ def propagate(
     information: FloatArray,
     num_cameras: int | None = None,
     errors: Iterable[FloatArray] | None = None,
-    max_bytes: int = DEFAULT_FACTOR_BYTES,
+    resources: Resources = ONE_THREAD,
 ) -> CameraUncertainty | None:
     """Return the uncertainty of locations from the information of the directions.
 
-    None if the factor would take more than `max_bytes`; 2 GB from about a hundred thousand cameras in space
+    None if the factor would take more than is allowed; 2 GB from about a hundred thousand cameras in space
     on.
 
     Args:
@@ -134,7 +135,7 @@ def propagate(
         num_cameras: the first so many nodes may decide the gauge; all if None.
         errors: samples (m, s, d) of the errors of the directions in radians, in consecutive parts, of which
             only one is held at a time; independent errors of that information if None.
-        max_bytes: limit of the factor.
+        resources: threads and limit of the factor.
 
     Raises:
         UnsolvableError: if the information is singular beyond repair: the graph is in pieces.
@@ -145,10 +146,10 @@ def propagate(
     if errors is None:
         terms = terms._replace(across=terms.across[:0].copy())
     plan = analyze(n, edges)
-    if plan.num_bytes(d) > max_bytes:
+    if plan.num_bytes(d) > resources.memory_bytes:
         return None
-    factor = _grounded_factor(plan, terms)
-    inverse = factor.selected_inverse(edges)
+    factor = _grounded_factor(plan, terms, resources.threads)
+    inverse = factor.selected_inverse()
     is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
     covariances, gauge = _fix_gauge(factor, inverse, locations, is_camera)
     if errors is not None:
@@ -173,7 +174,7 @@ def propagate_groups(
     information: FloatArray,
     gauge: GroupGauge,
     errors: Iterable[FloatArray] | None = None,
-    max_bytes: int = DEFAULT_FACTOR_BYTES,
+    resources: Resources = ONE_THREAD,
 ) -> CameraUncertainty | None:
     """Return the uncertainty of nodes of rigid groups, whose scale is held; the rest is as in `propagate`.
 
@@ -183,16 +184,16 @@ def propagate_groups(
         information: (m, d, d) of each direction.
         gauge: the groups of the nodes, and what of them is held fixed.
         errors: samples, as in `propagate`.
-        max_bytes: limit of the factor.
+        resources: threads and limit of the factor.
     """
     groups, share, has_cameras = gauge
     terms, d = inform(locations, edges, information), locations.shape[1]
     ends = np.ascontiguousarray(groups.group_of[edges])
     plan = analyze(groups.num_groups, ends)
-    if plan.num_bytes(d) > max_bytes:
+    if plan.num_bytes(d) > resources.memory_bytes:
         return None
-    factor = factorize(plan, terms.ridged(_RIDGES[0]))
-    inverse = factor.selected_inverse(ends)
+    factor = factorize(plan, terms.ridged(_RIDGES[0]), threads=resources.threads)
+    inverse = factor.selected_inverse()
     null = np.tile(np.eye(d), (len(share), 1, 1))
     fixed = share[:, None, None] * null
     covariances = regauged(inverse.nodes, factor.solve, null, fixed)
@@ -246,7 +247,7 @@ def _moved(factor: Factor, right: FloatArray, null: FloatArray, fixed: FloatArra
     return moved
 
 
-def _grounded_factor(plan: FactorPlan, terms: Information) -> Factor:
+def _grounded_factor(plan: FactorPlan, terms: Information, threads: int) -> Factor:
     """Factor H with its last camera grounded and the length of its longest baseline held."""
     longest = int(np.argmax(terms.lengths))
     held = np.trace(terms.blocks[longest]) * np.outer(terms.units[longest], terms.units[longest])
@@ -254,7 +255,7 @@ def _grounded_factor(plan: FactorPlan, terms: Information) -> Factor:
         regular = terms.ridged(ridge)
         regular[longest] += held
         try:
-            return factorize(plan, regular)
+            return factorize(plan, regular, threads=threads)
         except UnsolvableError:
             if ridge == _RIDGES[-1]:
                 raise

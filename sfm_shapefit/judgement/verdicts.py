@@ -25,9 +25,9 @@ from sfm_shapefit.judgement.uncertainty import (
     propagate_groups,
     standard_deviations,
 )
-from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.placement.conditioning import Conditioning, LooseCameras, condition
 from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement, own_covariances
+from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources
 from sfm_shapefit.solver.tied import largest_tied
 
 _PART = 2_000  # directions whose error samples are worked on at a time; bounds the memory
@@ -95,7 +95,7 @@ def assess(
     locations: FloatArray,
     *,
     undetermined_nodes: IntArray | None = None,
-    max_bytes: int = DEFAULT_FACTOR_BYTES,
+    resources: Resources = ONE_THREAD,
     agreement: AngularAgreement | None = None,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
@@ -106,12 +106,12 @@ def assess(
         locations: (n, d) its locations.
         undetermined_nodes: nodes whose position is a placeholder, such as those that the refinement reset:
             their standard deviations are infinite, and they hold no others; none if None.
-        max_bytes: limit of the factor for standard deviations.
+        resources: threads and limit of the factor for standard deviations.
         agreement: agreement of the same graph with the same locations; computed anew if None.
     """
     agreement = agreement or find_agreement(measured, locations)
     found = find_hold(
-        measured, locations, agreement, undetermined_nodes, max_bytes, apart_from_scale=_SCALE_APART
+        measured, locations, agreement, undetermined_nodes, resources, apart_from_scale=_SCALE_APART
     )
     held, sigmas = found.conditioning, standard_deviations(found.covariances)
     judged = judge_cameras(measured, locations, agreement.agrees, sigmas, held)
@@ -145,7 +145,7 @@ def find_hold(
     locations: FloatArray,
     agreement: AngularAgreement,
     undetermined_nodes: IntArray | None,
-    max_bytes: int,
+    resources: Resources,
     *,
     apart_from_scale: float = np.inf,
 ) -> Hold:
@@ -166,7 +166,7 @@ def find_hold(
     sampled = None if errors is None else _Sampled(errors, excess, scale)
     open_nodes = np.empty(0, np.int64) if undetermined_nodes is None else undetermined_nodes
     holding = inliers & ~np.isin(graph.edges, open_nodes).any(axis=1)
-    known, scale_sigma = (measured, locations, holding, information, sampled, max_bytes), np.inf
+    known, scale_sigma = (measured, locations, holding, information, sampled, resources), np.inf
     if measured.has_scale:
         covariances, leverages, scale_sigma = _propagate_groups(*known)
         scale_sigma *= scale
@@ -214,7 +214,7 @@ def _propagate_freely(
     inliers: BoolArray,
     information: FloatArray,
     sampled: _Sampled | None,
-    max_bytes: int,
+    resources: Resources,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the covariances (n, d, d) and the leverages (m,) of locations whose scale is open.
 
@@ -237,7 +237,7 @@ def _propagate_freely(
         try:
             samples = None if sampled is None else sampled.parts(graph.directions, rows)
             found = propagate(
-                locations[nodes], edges.reshape(-1, 2), information[rows], cameras, samples, max_bytes
+                locations[nodes], edges.reshape(-1, 2), information[rows], cameras, samples, resources
             )
         except UnsolvableError:  # singular in spite of the ridge
             continue
@@ -266,7 +266,7 @@ def _propagate_groups(
     inliers: BoolArray,
     information: FloatArray,
     sampled: _Sampled | None,
-    max_bytes: int,
+    resources: Resources,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return the covariances (n, d, d) and the leverages (m,) of rigid groups, their scale given.
 
@@ -292,7 +292,7 @@ def _propagate_groups(
     samples = None if sampled is None else sampled.parts(graph.directions, rows)
     gauge = GroupGauge(groups.restricted_to(nodes), share / share.sum(), cameras[tied] > 0)
     try:
-        found = propagate_groups(locations[nodes], edges, information[rows], gauge, samples, max_bytes)
+        found = propagate_groups(locations[nodes], edges, information[rows], gauge, samples, resources)
     except UnsolvableError:
         found = None
     if found is None:

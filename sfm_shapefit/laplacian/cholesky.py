@@ -9,9 +9,9 @@ solution"). For each supernode, children first:
 
 What depends on the graph alone is planned once (`analyze`); `refactor` takes new edge weights and does not
 sort. Disjoint subtrees are tasks for several threads, in the factorization and in both substitutions. A front
-above them is another task of the factorization, as soon as its children are done, and the large ones, which
-come last, are factored by strips of columns. What is summed, and in which order, depends on the graph alone,
-and so does every bit of the answer.
+above them is another task, as soon as its children are done. The large ones come last, and are factored by
+strips of columns. Threads share many right-hand sides instead of the tree. What is summed, and in which
+order, depends on the graph alone, and so does every bit of the answer.
 
 A Laplacian is singular: constants are its null space. The mean weight is added to the last pivot instead of
 removing a row. For right-hand sides orthogonal to the constants the answer is exact, the one that is 0 at
@@ -22,7 +22,7 @@ the answer garbage. Each pivot is therefore compared with the diagonal entry it 
 ratio, `smallest_pivot`, is of the order of the rounding unit where the graph is disconnected or not rigid.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -42,16 +42,17 @@ from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
 _LARGE_FRONT = 768  # rows of a front above the tasks; smaller ones give threads too little to share
 _STRIP = 256  # columns; of fewer, products are slower
+_COLUMNS = 8  # right-hand sides of one pass over the factor; of more, what is at work leaves the cache
+# Operations of a factorization, and products of a substitution, that take a third of a millisecond or more on
+# each of two threads; with fewer, handing out the work costs more than it saves.
+_FACTOR_WORTH_THREADS, _SOLVE_WORTH_THREADS = 1e8, 2e6
 
 # What is done with a front, one after the other.
 _ASSEMBLE, _FACTOR, _PASS_ON = range(3)
 
 
-class _Input(NamedTuple):
-    """What fronts are assembled from, as the kernels take it, all of one type in either precision.
-
-    Mostly the arrays of the plan. They and the weights are read-only.
-    """
+class _Tree(NamedTuple):
+    """Where the numbers of a factor belong, as the kernels take it: read-only arrays of the plan."""
 
     b: int
     first: IntArray
@@ -61,11 +62,29 @@ class _Input(NamedTuple):
     relative: Int32Array
     child_pointers: IntArray
     children: IntArray
+
+    @classmethod
+    def of(cls, plan: SymbolicFactor, b: int) -> "_Tree":
+        """Return that of a plan for b x b blocks."""
+        return cls(
+            b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, plan.relative,
+            plan.child_pointers, plan.children,
+        )  # fmt: skip
+
+
+class _Input(NamedTuple):
+    """What fronts are assembled from, of one type in either precision; arrays but offsets are read-only."""
+
+    tree: _Tree
     update_offsets: IntArray
     edge_pointers: IntArray
     edge_index: Int32Array
     edge_row: Int32Array
     edge_column: Int32Array
+    is_turned: BoolArray
+    sign: float
+    """1 if the entries beside the diagonal are minus the weights, which are symmetric; -1 if they are these,
+    to be transposed where an edge is turned."""
     weights: FloatArray
     """(m, b^2)"""
     diagonal: FloatArray
@@ -123,36 +142,34 @@ class CholeskyFactor:
                 "are not positive"
             )
 
-    def refactor_blocks(self, edges: IntArray, diagonal: FloatArray, off_diagonal: FloatArray) -> bool:
+    def refactor_blocks(self, diagonal: FloatArray, off_diagonal: FloatArray) -> bool:
         """Factor a symmetric matrix with blocks of its own at the nodes and edges, in place.
 
         Returns whether it is positive definite to working precision; the factor is unusable if not.
 
         Args:
-            edges: (m, 2) those that the factor was planned for.
             diagonal: (n, b, b) symmetric blocks of the nodes.
-            off_diagonal: (m, b, b) blocks (i, j) of the edges (i, j).
+            off_diagonal: (m, b, b) blocks (i, j) of the edges (i, j) that the factor was planned for.
         """
-        # Weights are subtracted, with the node that is eliminated first as the column.
-        weights = -off_diagonal
-        i, j = self.plan.inverse[edges].T
-        weights[i > j] = weights[i > j].transpose(0, 2, 1)
-        return self.refactor_alike(diagonal, weights)
+        return self._factor_with(diagonal, off_diagonal, -1.0)
 
     def refactor_alike(self, diagonal: FloatArray, weights: FloatArray) -> bool:
         """Factor the Laplacian of symmetric weights (m, b, b) with other blocks (n, b, b) at the nodes.
 
         Returns what `refactor_blocks` does.
         """
-        self._diagonal[:] = diagonal[self.plan.permutation].reshape(self._diagonal.shape)
-        return self._factor(self._input(np.ascontiguousarray(weights)))
+        return self._factor_with(diagonal, weights, 1.0)
 
-    def _input(self, weights: FloatArray) -> _Input:
+    def _factor_with(self, diagonal: FloatArray, weights: FloatArray, sign: float) -> bool:
+        self._diagonal[:] = diagonal[self.plan.permutation].reshape(self._diagonal.shape)
+        return self._factor(self._input(np.ascontiguousarray(weights), sign))
+
+    def _input(self, weights: FloatArray, sign: float = 1.0) -> _Input:
         plan, b = self.plan, self.block
         return _Input(
-            b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, plan.relative,
-            plan.child_pointers, plan.children, plan.update_offsets, plan.edge_pointers, plan.edge_index,
-            plan.edge_row, plan.edge_column, frozen(weights.reshape(plan.num_edges, b * b)), self._diagonal,
+            _Tree.of(plan, b), plan.update_offsets, plan.edge_pointers, plan.edge_index, plan.edge_row,
+            plan.edge_column, plan.is_turned, sign, frozen(weights.reshape(plan.num_edges, b * b)),
+            self._diagonal,
         )  # fmt: skip
 
     def _factor(self, given: _Input) -> bool:
@@ -175,9 +192,14 @@ class CholeskyFactor:
             total += float(np.log(panel[:: width + below + 1][:width]).sum())
         return 2.0 * total
 
-    def selected_inverse(self, edges: IntArray) -> SelectedInverse:
+    def selected_inverse(self) -> SelectedInverse:
         """Return the blocks of the inverse at nodes and edges; see `laplacian.selected`."""
-        return selected_inverse(self.plan, (self.block, self.panels), edges, self.workers)
+        return selected_inverse(self.plan, self.block, self.panels, self._useful_workers())
+
+    def _useful_workers(self) -> Workers:
+        """Return the threads, or one where handing them work on fronts costs more than it saves."""
+        worthwhile = self.plan.flops * self.block**3 >= _FACTOR_WORTH_THREADS
+        return self.workers if worthwhile else Workers(1)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with L x = rhs, with x = 0 at the grounded node, in float64.
@@ -191,13 +213,16 @@ class CholeskyFactor:
         if np.shape(rhs)[: len(lead)] != lead or np.ndim(rhs) > len(lead) + 1:
             raise ValueError(f"rhs has shape {np.shape(rhs)}, this factor takes {lead} or {(*lead, 'k')}")
         given = np.asarray(rhs, dtype=np.float64).reshape(n, b, -1)
-        out = np.empty_like(given)
-        for k in range(0, given.shape[2], 3):
-            width = min(given.shape[2] - k, 3)
-            x = np.zeros((n, b, 3), dtype=self.dtype)
-            x[:, :, :width] = given[plan.permutation, :, k : k + 3]
-            _substitute(self, x.reshape(n * b, 3))
-            out[plan.permutation, :, k : k + 3] = x[:, :, :width]
+        out, count = np.empty_like(given), given.shape[2]
+        parts = max(-(-count // _COLUMNS), 1)
+
+        def solve(part: int) -> None:
+            columns = slice(count * part // parts, count * (part + 1) // parts)
+            x = np.ascontiguousarray(given[plan.permutation, :, columns].reshape(n * b, -1).T, self.dtype)
+            _substitute(self, x, shares=parts == 1)
+            out[plan.permutation, :, columns] = x.T.reshape(n, b, -1)
+
+        self.workers.run([partial(solve, part) for part in range(parts)])
         return out.reshape(np.shape(rhs))
 
 
@@ -213,7 +238,7 @@ class _Fronts(NamedTuple):
     @classmethod
     def of(cls, factor: CholeskyFactor) -> "_Fronts":
         """Return those of a factor."""
-        plan, memory = factor.plan, FrontMemory(factor.plan, factor.workers.threads)
+        plan, memory = factor.plan, FrontMemory(factor.plan, factor._useful_workers().threads)
         is_large = (np.diff(plan.first) + np.diff(plan.row_pointers)) * factor.block >= _LARGE_FRONT
         for begin, end in plan.tasks:
             is_large[begin:end] = False
@@ -221,7 +246,6 @@ class _Fronts(NamedTuple):
         is_shared[plan.unit_of[is_large]] = True
         for unit, below in enumerate(plan.needs):
             is_shared[unit] |= is_shared[list(below)].any()
-        is_shared &= memory.num_arenas > 1
         own, place = np.flatnonzero(~is_shared).tolist(), np.cumsum(~is_shared) - 1
         needs = [place[list(plan.needs[unit])].tolist() for unit in own]
         return cls(memory, is_large, own, needs, np.flatnonzero(is_shared).tolist())
@@ -233,6 +257,9 @@ def _factor_all(factor: CholeskyFactor, given: _Input, fronts: _Fronts) -> tuple
     memory.begin()
     units, given = memory.units, given._replace(update_offsets=memory.offsets)
     stack = np.empty(memory.size * factor.block**2, dtype=factor.dtype)  # holds update matrices
+    if memory.num_arenas == 1:
+        whole, pivot = (0, plan.num_supernodes), np.full(2, np.inf)
+        return _factor_unit(factor, given, stack, whole, fronts.is_large, pivot), pivot
     pivots, failed = np.full((len(units), 2), np.inf), np.zeros(len(units), np.bool_)
 
     def factor_unit(unit: int) -> None:
@@ -240,7 +267,8 @@ def _factor_all(factor: CholeskyFactor, given: _Input, fronts: _Fronts) -> tuple
             failed[unit] = True
             return
         with memory.room(unit, memory.leaving[unit], memory.entering[unit]):
-            failed[unit] = _factor_unit(factor, given, stack, units[unit], fronts.is_large, pivots[unit])
+            run = units[unit].tolist()
+            failed[unit] = _factor_unit(factor, given, stack, run, fronts.is_large, pivots[unit])
 
     factor.workers.run_after([partial(factor_unit, unit) for unit in fronts.own], fronts.needs)
     for unit in fronts.shared:
@@ -249,16 +277,16 @@ def _factor_all(factor: CholeskyFactor, given: _Input, fronts: _Fronts) -> tuple
 
 
 def _factor_unit(
-    factor: CholeskyFactor, given: _Input, stack: npt.NDArray[Any], unit: IntArray, is_large: BoolArray,
+    factor: CholeskyFactor, given: _Input, stack: npt.NDArray[Any], unit: Sequence[int], is_large: BoolArray,
     pivot: Any,
 ) -> bool:  # fmt: skip
-    """Factor the supernodes of a unit, the large ones by strips; return whether a pivot was not positive."""
+    """Factor supernodes begin..end-1, the large ones by strips; return whether a pivot was not positive."""
 
     def run(first: int, last: int, from_step: int, to_step: int) -> bool:
         blas = blas_of(factor.dtype)
         return _factorize(first, last, from_step, to_step, given, factor.panels, stack, pivot, blas)
 
-    at, end = unit.tolist()
+    at, end = unit
     for s in [*(np.flatnonzero(is_large[at:end]) + at).tolist(), end]:
         if at < s and run(at, s, _ASSEMBLE, _PASS_ON):
             return True
@@ -354,8 +382,8 @@ def _subtract_strip(
 @kernel
 def _sum_at_nodes(given: Any) -> None:
     """Write the diagonal blocks of the Laplacian, in elimination order: sums over incident edges."""
-    first, row_pointers, rows, begin = given.first, given.row_pointers, given.rows, given.edge_pointers
-    index, row, column = given.edge_index, given.edge_row, given.edge_column
+    first, row_pointers, rows = given.tree.first, given.tree.row_pointers, given.tree.rows
+    begin, index, row, column = given.edge_pointers, given.edge_index, given.edge_row, given.edge_column
     weights, diagonal = given.weights, given.diagonal
     diagonal[:] = 0.0
     for s in range(len(first) - 1):
@@ -379,14 +407,15 @@ def _factorize(
 
     `pivot` is lowered to the least ratio of a squared pivot to its diagonal entry and the row it stands in.
     """
-    b, first, row_pointers, diagonal = given.b, given.first, given.row_pointers, given.diagonal
-    index, row, column, weights = given.edge_index, given.edge_row, given.edge_column, given.weights
+    tree, diagonal, weights = given.tree, given.diagonal, given.weights
+    b, first, row_pointers = tree.b, tree.first, tree.row_pointers
+    index, row, column = given.edge_index, given.edge_row, given.edge_column
     size = panels.itemsize
     for s in range(begin, end):
         start, width = first[s] * b, (first[s + 1] - first[s]) * b
         below = (row_pointers[s + 1] - row_pointers[s]) * b
         height = width + below
-        offset = given.panel_pointers[s] * b * b
+        offset = tree.panel_pointers[s] * b * b
         panel = panels[offset : offset + width * height]
         update = given.update_offsets[s] * b * b
         for step in range(from_step, to_step + 1):
@@ -406,10 +435,11 @@ def _factorize(
                 panel[:] = 0.0
                 for k in range(given.edge_pointers[s], given.edge_pointers[s + 1]):
                     e = index[k]
+                    by_column, by_row = (1, b) if given.sign < 0.0 and given.is_turned[e] else (b, 1)
                     for c in range(b):
                         at = (column[k] * b + c) * height + row[k] * b
                         for a in range(b):
-                            panel[at + a] -= weights[e, c * b + a]
+                            panel[at + a] -= given.sign * weights[e, c * by_column + a * by_row]
                 for i in range(width * b):
                     q = i // b
                     node = q // b
@@ -437,11 +467,11 @@ def _add_children(
     `target` starts at row and column `lowest`. Consecutive rows mostly stay consecutive and are added as
     vectors.
     """
-    b = given.b
-    for k in range(given.child_pointers[s], given.child_pointers[s + 1]):
-        child = given.children[k]
+    tree, b = given.tree, given.tree.b
+    for k in range(tree.child_pointers[s], tree.child_pointers[s + 1]):
+        child = tree.children[k]
         # Where the child's rows are in this front.
-        there = given.relative[given.row_pointers[child] : given.row_pointers[child + 1]]
+        there = tree.relative[tree.row_pointers[child] : tree.row_pointers[child + 1]]
         size = len(there)
         run_end = np.empty(size, np.int64)
         for i in range(size - 1, -1, -1):
@@ -465,63 +495,67 @@ def _add_children(
                     skip = 0
 
 
-def _substitute(factor: CholeskyFactor, x: npt.NDArray[Any]) -> None:
-    """Solve L L^T y = x in place for three right-hand sides: the tasks, what is above them, and back."""
+def _substitute(factor: CholeskyFactor, x: npt.NDArray[Any], *, shares: bool) -> None:
+    """Solve L L^T y = x in place for right-hand sides, the rows of x; threads may share the tree."""
     plan, b = factor.plan, factor.block
-    outer = np.zeros((len(plan.tasks), *x.shape), dtype=x.dtype)  # what each task leaves for rows above it
+    updates = np.empty((len(x), len(plan.rows) * b), x.dtype)
+    tree = _Tree.of(plan, b)
 
-    def descend(run: IntArray, outer: npt.NDArray[Any]) -> Callable[[], object]:
-        work = np.empty((3, plan.largest_front * b), x.dtype)
-        begin, end = run
-        return lambda: _descend(
-            begin, end, b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x,
-            work, outer,
-        )  # fmt: skip
+    def descend(begin: int, end: int) -> None:
+        _descend(begin, end, tree, factor.panels, x, updates)
 
-    def ascend(run: IntArray) -> Callable[[], object]:
-        work, sums = np.empty((3, plan.largest_front * b), x.dtype), np.empty((3, 4), x.dtype)
-        begin, end = run
-        return lambda: _ascend(
-            begin, end, b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x,
-            work, sums,
-        )  # fmt: skip
+    def ascend(begin: int, end: int) -> None:
+        _ascend(begin, end, tree, factor.panels, x)
 
-    factor.workers.run([descend(task, outer[k]) for k, task in enumerate(plan.tasks)])
-    nodes = (plan.num_nodes, b, 3)
-    for k, (_, end) in enumerate(plan.tasks):
-        rows = plan.rows[plan.row_pointers[end - 1] : plan.row_pointers[end]]
-        x.reshape(nodes)[rows] += outer[k].reshape(nodes)[rows]
-    for run in plan.above:
-        descend(run, x)()
-    for run in plan.above[::-1]:
-        ascend(run)()
-    factor.workers.run([ascend(task) for task in plan.tasks])
+    if not shares or plan.num_entries * b * b * len(x) < _SOLVE_WORTH_THREADS or factor.workers.threads == 1:
+        descend(0, plan.num_supernodes)
+        ascend(0, plan.num_supernodes)
+        return
+    units = plan.units.tolist()
+    factor.workers.run_after([partial(descend, *unit) for unit in units], plan.needs)
+    factor.workers.run_after([partial(ascend, *unit) for unit in units[::-1]], plan.needs_back())
+
+
+@inner_kernel
+def _tallest(begin: int, end: int, tree: Any) -> int:
+    """Return the most rows of a panel of the supernodes begin..end-1."""
+    columns, rows, most = tree.first, tree.row_pointers, 0
+    for s in range(begin, end):
+        most = max(most, columns[s + 1] - columns[s] + rows[s + 1] - rows[s])
+    return most * int(tree.b)
+
+
+@inner_kernel
+def _copy(source: Any, begin: int, target: Any, start: int, count: int) -> None:
+    """Copy so many numbers of each row of an array to another."""
+    for k in range(len(source)):
+        for i in range(count):
+            target[k, start + i] = source[k, begin + i]
 
 
 @kernel
-def _descend(
-    begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any,
-    x: Any, work: Any, outer: Any,
-) -> None:  # fmt: skip
-    """Solve with the panels of the supernodes begin..end-1; later rows than theirs are kept in `outer`.
+def _descend(begin: int, end: int, tree: Any, panels: Any, x: Any, updates: Any) -> None:
+    """Solve with the panels of the supernodes begin..end-1, for each row of x.
 
-    The rows below a block of four columns take all four at once. The last block may overlap the one before,
-    whose columns then count 0.
+    What a supernode takes from rows above it waits in `updates` until its parent adds it. The rows below a
+    block of four columns take all four at once. The last block may overlap the one before, whose columns then
+    count 0.
     """
-    zero, limit = work.dtype.type(0), first[end] * b
+    b, first, row_pointers = tree.b, tree.first, tree.row_pointers
+    work, zero = np.empty((len(x), _tallest(begin, end, tree)), x.dtype), x.dtype.type(0)
     for s in range(begin, end):
         start, width = first[s] * b, (first[s + 1] - first[s]) * b
         height = width + (row_pointers[s + 1] - row_pointers[s]) * b
-        offset = panel_pointers[s] * b * b
-        for i in range(width):
-            work[0, i], work[1, i], work[2, i] = x[start + i, 0], x[start + i, 1], x[start + i, 2]
+        offset = tree.panel_pointers[s] * b * b
+        _copy(x, start, work, 0, width)
         work[:, width:height] = zero
+        _add_updates(s, tree, updates, work)
         for j in range(0, width, 4):
             stop = min(j + 4, width)
             last = stop if width >= 4 else height
             for q in range(j, stop):
                 column = offset + q * height
-                for k in range(3):
+                for k in range(len(x)):
                     value = work[k, q] / panels[column + q]
                     work[k, q] = value
                     for i in range(q + 1, last):
@@ -533,7 +567,7 @@ def _descend(
             l1 = panels[column + height + stop : column + 2 * height]
             l2 = panels[column + 2 * height + stop : column + 3 * height]
             l3 = panels[column + 3 * height + stop : column + 4 * height]
-            for k in range(3):
+            for k in range(len(x)):
                 a0 = work[k, q] if q >= j else zero
                 a1 = work[k, q + 1] if q + 1 >= j else zero
                 a2 = work[k, q + 2] if q + 2 >= j else zero
@@ -541,52 +575,51 @@ def _descend(
                 u = work[k, stop:height]
                 for i in range(below):
                     u[i] -= l0[i] * a0 + l1[i] * a1 + l2[i] * a2 + l3[i] * a3
-        for i in range(width):
-            x[start + i, 0], x[start + i, 1], x[start + i, 2] = work[0, i], work[1, i], work[2, i]
-        at = width
-        for p in range(row_pointers[s], row_pointers[s + 1]):
-            row = np.int64(rows[p]) * b
-            target = x if row < limit else outer
-            for i in range(row, row + b):
-                target[i, 0] += work[0, at]
-                target[i, 1] += work[1, at]
-                target[i, 2] += work[2, at]
-                at += 1
+        _copy(work, 0, x, start, width)
+        _copy(work, width, updates, row_pointers[s] * b, height - width)
+
+
+@inner_kernel
+def _add_updates(s: int, tree: Any, updates: Any, work: Any) -> None:
+    """Add what the children of a supernode take from its rows."""
+    b = tree.b
+    for p in range(tree.child_pointers[s], tree.child_pointers[s + 1]):
+        child = tree.children[p]
+        for r in range(tree.row_pointers[child], tree.row_pointers[child + 1]):
+            at = np.int64(tree.relative[r]) * b
+            for k in range(len(work)):
+                for c in range(b):
+                    work[k, at + c] += updates[k, r * b + c]
 
 
 @kernel
-def _ascend(
-    begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any,
-    x: Any, work: Any, sums: Any,
-) -> None:  # fmt: skip
+def _ascend(begin: int, end: int, tree: Any, panels: Any, x: Any) -> None:
     """Solve with the transposed panels of the supernodes end-1..begin, in the blocks of `_descend`."""
+    b, first, row_pointers = tree.b, tree.first, tree.row_pointers
+    work, sums = np.empty((len(x), _tallest(begin, end, tree)), x.dtype), np.empty(4, x.dtype)
     for s in range(end - 1, begin - 1, -1):
         start, width = first[s] * b, (first[s + 1] - first[s]) * b
         height = width + (row_pointers[s + 1] - row_pointers[s]) * b
-        offset = panel_pointers[s] * b * b
-        for i in range(width):
-            work[0, i], work[1, i], work[2, i] = x[start + i, 0], x[start + i, 1], x[start + i, 2]
-        at = width
-        for p in range(row_pointers[s], row_pointers[s + 1]):
-            row = np.int64(rows[p]) * b
-            for i in range(row, row + b):
-                work[0, at], work[1, at], work[2, at] = x[i, 0], x[i, 1], x[i, 2]
-                at += 1
+        offset = tree.panel_pointers[s] * b * b
+        _copy(x, start, work, 0, width)
+        for r in range(row_pointers[s], row_pointers[s + 1]):
+            row, at = np.int64(tree.rows[r]) * b, width + (r - row_pointers[s]) * b
+            for k in range(len(x)):
+                for c in range(b):
+                    work[k, at + c] = x[k, row + c]
         for j in range((width - 1) // 4 * 4, -1, -4):
             stop = min(j + 4, width)
             last = stop if width >= 4 else height
-            if width >= 4:
-                four = offset + (stop - 4) * height + stop
-                multiply_in_lanes(panels, four, height, work, stop, height - stop, sums)
-                for k in range(3):
+            for k in range(len(x)):
+                if width >= 4:
+                    four = offset + (stop - 4) * height + stop
+                    multiply_in_lanes(panels, four, height, work[k], stop, height - stop, sums)
                     for q in range(j, stop):
-                        work[k, q] -= sums[k, q - stop + 4]
-            for q in range(stop - 1, j - 1, -1):
-                column = offset + q * height
-                for k in range(3):
+                        work[k, q] -= sums[q - stop + 4]
+                for q in range(stop - 1, j - 1, -1):
+                    column = offset + q * height
                     total = work[k, q]
                     for i in range(q + 1, last):
                         total -= panels[column + i] * work[k, i]
                     work[k, q] = total / panels[column + q]
-        for i in range(width):
-            x[start + i, 0], x[start + i, 1], x[start + i, 2] = work[0, i], work[1, i], work[2, i]
+        _copy(work, 0, x, start, width)

@@ -57,7 +57,7 @@ class Factor(LaplacianFactor, Protocol):
     def refactor(self, weights: FloatArray, ground: float | None = None) -> None:
         """Factor the Laplacian of edge weights; UnsolvableError if it is singular."""
 
-    def refactor_blocks(self, edges: IntArray, diagonal: FloatArray, off_diagonal: FloatArray) -> bool:
+    def refactor_blocks(self, diagonal: FloatArray, off_diagonal: FloatArray) -> bool:
         """Factor a matrix with blocks of its own; return whether it is positive definite."""
         ...
 
@@ -65,8 +65,8 @@ class Factor(LaplacianFactor, Protocol):
         """Factor a Laplacian with blocks of its own at the nodes; return whether it is positive definite."""
         ...
 
-    def selected_inverse(self, edges: IntArray) -> SelectedInverse:
-        """Return the blocks of the inverse at the nodes and edges (m, 2)."""
+    def selected_inverse(self) -> SelectedInverse:
+        """Return the blocks of the inverse at the nodes and edges."""
         ...
 
     def log_determinant(self) -> float:
@@ -118,9 +118,11 @@ def factorize(
     weights: FloatArray,
     dtype: npt.DTypeLike = np.float64,
     ground: float | None = None,
+    *,
+    threads: int = 1,
 ) -> Factor:
     """Allocate a factor and compute it; see `CholeskyFactor.refactor`."""
     block = 1 if np.ndim(weights) == 1 else np.shape(weights)[1]
-    factor = allocate_factor(plan, block, dtype)
+    factor = allocate_factor(plan, block, dtype, threads=threads)
     factor.refactor(weights, ground)
     return factor

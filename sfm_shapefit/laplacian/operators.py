@@ -183,7 +183,8 @@ class Workers:
             work()
         finally:
             for helper in helpers:
-                helper.result()
+                if not helper.cancel():  # one that has not begun has nothing left to do
+                    helper.result()
 
     def share(self, starts: IntArray, work: Callable[[int, int], object], least: int = 1) -> None:
         """Call `work(begin, end)` for ranges of rows, whose answers must not depend on how they are cut.
@@ -296,3 +297,16 @@ def _apply_entries(
             for p in range(pointers[i], pointers[i + 1]):
                 total += np.float64(entries[p]) * (x[i, k] - x[neighbors[p], k])
             out[i, k] = total
+
+
+@kernel
+def apply_blocks(edges: Any, blocks: Any, x: Any, axes: Any, out: Any) -> None:
+    """Add D^T diag(B_e) D x to out (n, d); the length of `axes` tells the compiler the dimension."""
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        for a in range(len(axes)):
+            pull = 0.0
+            for b in range(len(axes)):
+                pull += blocks[e, a, b] * (x[i, b] - x[j, b])
+            out[i, a] += pull
+            out[j, a] -= pull

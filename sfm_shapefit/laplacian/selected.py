@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.jit import array_address, inner_kernel, kernel
 from sfm_shapefit.laplacian.dense import Blas, blas_of, gemm, trsm
@@ -49,23 +49,20 @@ def regauged(nodes: FloatArray, solve: _Solve, null: FloatArray, dual: FloatArra
     return np.asarray(nodes - cross - cross.transpose(0, 2, 1) + null @ middle @ null.transpose(0, 2, 1))
 
 
-def selected_inverse(
-    plan: SymbolicFactor, factor: tuple[int, FloatArray], edges: IntArray, workers: Workers
-) -> SelectedInverse:
-    """Return the blocks of the inverse at the nodes and edges of the graph.
+def selected_inverse(plan: SymbolicFactor, b: int, panels: FloatArray, workers: Workers) -> SelectedInverse:
+    """Return the blocks of the inverse at the nodes and edges of the graph of a factor.
 
     Args:
         plan: of the factor.
-        factor: b and the panels; its blocks are b x b.
-        edges: (m, 2) those that it was planned for, which say how each block is to be turned.
+        b: its blocks are b x b.
+        panels: of the factor.
         workers: the threads.
 
     Raises:
-        ValueError: if it is not float64, or the edges are not as many.
+        ValueError: if it is not float64.
     """
-    b, panels = factor
-    if panels.dtype != np.float64 or len(edges) != plan.num_edges:
-        raise ValueError("selected_inverse takes a float64 factor and the edges it was planned for")
+    if panels.dtype != np.float64:
+        raise ValueError("selected_inverse takes a float64 factor")
     nodes, blocks = np.empty((plan.num_nodes, b, b)), np.empty((plan.num_edges, b, b))
     rooms = FrontMemory(plan, workers.threads)
     widths, below = np.diff(plan.first) * b, np.diff(plan.row_pointers) * b
@@ -75,23 +72,22 @@ def selected_inverse(
     plan_arrays = _Plan(
         b, plan.first, plan.row_pointers, plan.panel_pointers, plan.relative, plan.child_pointers,
         plan.children, plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
-        plan.permutation,
+        plan.is_turned, plan.permutation,
     )  # fmt: skip
+
+    def memory(arena: int) -> _Memory:
+        return _Memory(waiting, work[arena], starts[:-1], rooms.offsets, blas_of(panels.dtype))
 
     def invert(unit: int) -> None:
         with rooms.room(unit, rooms.entering[unit], rooms.leaving[unit]) as arena:
-            memory = _Memory(waiting, work[arena], starts[:-1], rooms.offsets, blas_of(panels.dtype))
-            _invert(rooms.units[unit], plan_arrays, panels, memory, nodes, blocks)
+            _invert(rooms.units[unit], plan_arrays, panels, memory(arena), nodes, blocks)
 
-    last = len(rooms.units) - 1
-    needs = [list[int]() for _ in rooms.units]  # from the last unit to the first, now the parents of each
-    for unit, children in enumerate(plan.needs):
-        for child in children:
-            needs[last - child].append(last - unit)
     with one_blas_thread():
-        workers.run_after([partial(invert, last - k) for k in range(last + 1)], needs)
-    reversed_edges = plan.inverse[edges[:, 0]] < plan.inverse[edges[:, 1]]  # stored: (later, earlier)
-    blocks[reversed_edges] = blocks[reversed_edges].transpose(0, 2, 1)
+        if rooms.num_arenas == 1:
+            _invert(np.array([0, plan.num_supernodes]), plan_arrays, panels, memory(0), nodes, blocks)
+        else:
+            units = range(len(rooms.units) - 1, -1, -1)
+            workers.run_after([partial(invert, unit) for unit in units], plan.needs_back())
     return SelectedInverse(nodes=nodes, edges=blocks)
 
 
@@ -107,6 +103,7 @@ class _Plan(NamedTuple):
     edge_index: Int32Array
     edge_row: Int32Array
     edge_column: Int32Array
+    is_turned: BoolArray
     permutation: IntArray
 
 
@@ -124,7 +121,7 @@ class _Memory(NamedTuple):
 def _invert(run: Any, plan: Any, panels: Any, memory: Any, nodes: Any, blocks: Any) -> None:
     """Write the inverse's blocks of the nodes (n, b, b) and edges (m, b, b) of a run of supernodes.
 
-    The later node of an edge comes first. BLAS subtracts products here, hence the signs of what is kept.
+    BLAS subtracts products here, hence the signs of what is kept.
     """
     b, first, row_pointers, work, blas = plan.b, plan.first, plan.row_pointers, memory.work, memory.blas
     root_at, own_at, y_at, cross_at = memory.starts
@@ -209,6 +206,10 @@ def _store(s: int, plan: Any, inverse: Any, width: int, nodes: Any, blocks: Any)
         for a in range(b):
             for c in range(b):
                 if row < width:
-                    blocks[e, a, c] = -own[(row + a) * width + column + c]
+                    value = -own[(row + a) * width + column + c]
                 else:
-                    blocks[e, a, c] = cross[(row + a - width) * width + column + c]
+                    value = cross[(row + a - width) * width + column + c]
+                if plan.is_turned[e]:  # the row is of its first node
+                    blocks[e, a, c] = value
+                else:
+                    blocks[e, c, a] = value

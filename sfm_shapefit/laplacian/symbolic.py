@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import Int32Array, IntArray, distinct, frozen
+from sfm_shapefit.base.arrays import BoolArray, Int32Array, IntArray, distinct, frozen
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.laplacian.operators import Adjacency, group_by
 
@@ -110,6 +110,8 @@ class SymbolicFactor:
     """(m,) row of each of these edges in its panel."""
     edge_column: Int32Array
     """(m,) column of each of these edges in its panel."""
+    is_turned: BoolArray
+    """(m,) whether the second node of an edge is eliminated before the first; in the order of the edges."""
     num_nonzeros: int
     """Entries of the scalar factor L without any explicit zero."""
     flops: float
@@ -119,6 +121,15 @@ class SymbolicFactor:
     def units(self) -> IntArray:
         """The tasks and the runs above them, (U, 2), ascending."""
         return np.sort(np.concatenate([self.tasks, self.above]), axis=0)
+
+    def needs_back(self) -> list[list[int]]:
+        """Return `needs` for units that come from the last to the first: the places of those with parents."""
+        last = len(self.needs) - 1
+        needs: list[list[int]] = [[] for _ in self.needs]
+        for unit, children in enumerate(self.needs):
+            for child in children:
+                needs[last - child].append(last - unit)
+        return needs
 
     @property
     def num_nodes(self) -> int:
@@ -210,6 +221,7 @@ def plan_factorization(graph: Adjacency, edges: IntArray, tree: EliminationTree)
         edge_index=frozen(index),
         edge_row=frozen(edge_row),
         edge_column=frozen(edge_column),
+        is_turned=frozen(i > j),
         num_nonzeros=tree.num_nonzeros,
         flops=tree.flops,
     )

@@ -227,7 +227,7 @@ def _database_of_output(folder: Path) -> Path | None:
     """Return the database that an output names, if it is there and has all images of it; else None."""
     with suppress(InputError):
         path = told_of(folder, "inputs", lambda found: Path(found.get("database")))
-        if path is not None and path.is_file():
+        if path is not None and path.is_absolute() and path.is_file():
             names = sorted(read_trust(folder / "cameras.csv"))
             with closing(DatabaseFile(path)) as file:
                 return path if {*range(len(names))} <= {*match_names(file, names).values()} else None

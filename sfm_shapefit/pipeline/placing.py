@@ -13,7 +13,6 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.measured_pairs import MeasuredPairs
 from sfm_shapefit.judgement.verdicts import Hold, find_hold
-from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.pipeline.measure import add_evidence, build_graph
 from sfm_shapefit.placement.fixed_and_rigged import FixedAndRigged
 from sfm_shapefit.placement.place import Placement, place_pieces
@@ -21,6 +20,7 @@ from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.solver.solver_options import reported
+from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources
 from sfm_shapefit.tracks.structure_options import NodeOptions
 
 _FITTING = 0.95  # share of pairs that agree with a placement; from here on no other is tried
@@ -130,12 +130,12 @@ def _count_held(placement: Placement, options: PlacementOptions) -> int:
     Whether the agreeing pairs tie them is not enough: in the park of fisheyes (kerry-park) they do, and hold
     18 of 48 cameras so loosely that points are needed.
     """
-    return measure_hold(placement, options.solver.factor_bytes).conditioning.causes.count(None)
+    return measure_hold(placement, Resources.of(options.solver)).conditioning.causes.count(None)
 
 
 @one_blas_thread()  # as `judge`, which asks the same where the cameras stay
-def measure_hold(placement: Placement, max_bytes: int = DEFAULT_FACTOR_BYTES) -> Hold:
-    """Return how well the agreeing pairs hold the placed cameras, by a factor of `max_bytes` at most."""
+def measure_hold(placement: Placement, resources: Resources = ONE_THREAD) -> Hold:
+    """Return how well the agreeing pairs hold the placed cameras."""
     hand_back_memory()  # what the solve took
     part, refined = placement.measured_part(), placement.refined
-    return find_hold(part, refined.locations, placement.agreement, refined.reset_nodes, max_bytes)
+    return find_hold(part, refined.locations, placement.agreement, refined.reset_nodes, resources)

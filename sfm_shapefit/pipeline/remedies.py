@@ -123,13 +123,8 @@ def _longest_offset(inputs: RunInputs) -> float:
 
 
 def _contradicts_rigs(result: LocateResult, inputs: RunInputs) -> bool:
-    """Return whether matches inside frames put a sensor elsewhere in its rig, of which nothing is fixed."""
-    may_be = inputs.images.has_rigs and not inputs.fixed.any()
-    return may_be and any(find_contradicted_rigs(result.images, result.directions))
-
-
-def _loses(result: LocateResult, before: object) -> bool:
-    return isinstance(before, LocateResult) and bool(result.kept.sum() < before.kept.sum())
+    """Return whether matches inside frames put a sensor elsewhere in its rig."""
+    return inputs.images.has_rigs and any(find_contradicted_rigs(result.images, result.directions))
 
 
 def _run_with_other_offsets(
@@ -140,9 +135,9 @@ def _run_with_other_offsets(
 ) -> tuple[RunInputs, MatchSource, LocateResult, tuple[str, ...]]:
     """Return what to start from in place of sensors that fail, what comes of it, and a note.
 
-    They stand where matches inside frames put them, as far away as the rig has them, and are free. If these
-    say nothing else, sensors of `map` that are left open are held, and offsets that are too short to tell a
-    scale are taken for 0.
+    They stand where matches inside frames put them, as far away as the rig has them, and are free, unless a
+    frame is fixed. If these say nothing else, sensors of `map` that are left open are held, and offsets that
+    are too short to tell a scale are taken for 0.
 
     ContradictedOffsetsError, OpenSensorError: if neither is so.
     """
@@ -150,12 +145,13 @@ def _run_with_other_offsets(
     directions = measure(source, inputs.options.directions, clock).directions
     wrong = [one.statement for one in find_contradicted_rigs(images, directions)]
     offsets = measured_offsets(images, directions)
-    is_moved = (offsets != images.sensors.translations).any()
-    may_free = freedom.adjusts_cameras(images.num_images)
-    for is_free in (True, False) if is_moved and may_free else (False,) * bool(is_moved):
-        start = with_offsets(_with_rigs(inputs, "free" if is_free else "held"), source, offsets)
+    least = int(why.kept.sum()) if isinstance(why, LocateResult) else 0
+    ways: list[RigFreedom] = ["free", "held"] if freedom.adjusts_cameras(images.num_images) else ["held"]
+    is_moved = (offsets != images.sensors.translations).any() and not inputs.fixed.any()
+    for rigs in ways if is_moved else ():
+        start = with_offsets(_with_rigs(inputs, rigs), source, offsets)
         result = _run_in_scale(*start, clock)
-        if isinstance(result, LocateResult) and not _loses(result, why):
+        if isinstance(result, LocateResult) and result.kept.sum() >= least:
             doubt = f"{wrong[0]}, so sensors are placed by these matches, as far away as the rig has them"
             suspicions = (*result.suspicions, of_model(Kind.INPUT, doubt))
             return *start, replace(result, suspicions=suspicions), ()

@@ -309,41 +309,49 @@ def _residuals(graph: ViewGraph, t: FloatArray) -> FloatArray:
 def _inform(begin: int, end: int, covariance: Any, v: Any, level: Any, out: Any) -> None:
     """Write B (Sigma + level^2 I)^-1 B^T + m v v^T of the pairs begin..end-1, B as of `tangent_bases`.
 
-    A covariance that is not finite is unknown, and counts as 0: the level alone speaks for the pair.
+    B are the last columns of I - f h h^T with h = v -+ the first axis. A covariance that is not finite is
+    unknown, and counts as 0: the level alone speaks for the pair.
     """
     d = v.shape[1]
-    basis, inverse = np.empty((d, d - 1)), np.empty((d - 1, d - 1))
+    inverse, h, turned = np.zeros((d, d)), np.empty(d), np.empty(d)
     for e in range(begin, end):
-        sign = -1.0 if v[e, 0] < 0.0 else 1.0
-        is_known, factor, mean = True, 2.0 / (2.0 + 2.0 * abs(v[e, 0])), 0.0
-        for p in range(d - 1):
-            for a in range(d):
-                mirrored = v[e, 0] + sign if a == 0 else v[e, a]
-                basis[a, p] = (1.0 if a == p + 1 else 0.0) - factor * mirrored * v[e, p + 1]
-            for q in range(d - 1):
-                is_known = is_known and np.isfinite(covariance[e, p, q])
-        for p in range(d - 1):
-            for q in range(d - 1):
-                inverse[p, q] = covariance[e, p, q] if is_known else 0.0
-            inverse[p, p] += level[e] ** 2
-        for p in range(d - 1):  # Gauss and Jordan's elimination, in place
-            pivot, inverse[p, p] = inverse[p, p], 1.0
-            for q in range(d - 1):
-                inverse[p, q] /= pivot
-            for a in range(d - 1):
-                if a != p:
-                    pivot, inverse[a, p] = inverse[a, p], 0.0
-                    for q in range(d - 1):
-                        inverse[a, q] -= pivot * inverse[p, q]
-        for p in range(d - 1):
-            mean += inverse[p, p] / (d - 1)
+        _invert_sum(covariance[e], level[e] ** 2, inverse)
+        f, mean, square = 1.0 / (1.0 + abs(v[e, 0])), 0.0, 0.0
+        for a in range(d):
+            h[a] = v[e, a]
+            mean += inverse[a, a] / (d - 1)
+        h[0] += -1.0 if v[e, 0] < 0.0 else 1.0
+        for a in range(d):
+            turned[a] = 0.0
+            for b in range(d):
+                turned[a] += f * inverse[a, b] * h[b]
+            square += f * h[a] * turned[a]
         for a in range(d):
             for b in range(d):
-                total = mean * v[e, a] * v[e, b]
-                for p in range(d - 1):
-                    for q in range(d - 1):
-                        total += basis[a, p] * inverse[p, q] * basis[b, q]
-                out[e, a, b] = total
+                mirrored = h[a] * (square * h[b] - turned[b]) - turned[a] * h[b]
+                out[e, a, b] = inverse[a, b] + mirrored + mean * v[e, a] * v[e, b]
+
+
+@inner_kernel
+def _invert_sum(covariance: Any, level2: float, a: Any) -> None:
+    """Write (Sigma + level^2 I)^-1 to all but the first row and column (Gauss and Jordan's elimination)."""
+    d, is_known = len(a), True
+    for p in range(1, d):
+        for k in range(1, d):
+            is_known = is_known and np.isfinite(covariance[p - 1, k - 1])
+    for p in range(1, d):
+        for k in range(1, d):
+            a[p, k] = covariance[p - 1, k - 1] if is_known else 0.0
+        a[p, p] += level2
+    for p in range(1, d):
+        pivot, a[p, p] = a[p, p], 1.0
+        for k in range(1, d):
+            a[p, k] /= pivot
+        for i in range(1, d):
+            if i != p:
+                factor, a[i, p] = a[i, p], 0.0
+                for k in range(1, d):
+                    a[i, k] -= factor * a[p, k]
 
 
 @kernel

@@ -5,15 +5,13 @@ weights are the mean eigenvalues of the blocks: a float32 factor, which has 27 t
 of the blocks in three dimensions, or where it fills in the diagonal, or an approximate factor.
 """
 
-from typing import Any
-
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
 from sfm_shapefit.laplacian.factor import LaplacianFactor
+from sfm_shapefit.laplacian.operators import apply_blocks
 from sfm_shapefit.solver.splitting.linear import preconditioner
 
 _REDUCTION = 0.1  # share of the residual that a solve may leave; damped steps need no more
@@ -51,18 +49,5 @@ class IterativeNormal:
 
     def _apply(self, x: FloatArray) -> FloatArray:
         out = np.zeros_like(x, order="C")
-        _apply_blocks(self._edges, self._blocks, np.ascontiguousarray(x), tuple(range(x.shape[1])), out)
+        apply_blocks(self._edges, self._blocks, np.ascontiguousarray(x), tuple(range(x.shape[1])), out)
         return out
-
-
-@kernel
-def _apply_blocks(edges: Any, blocks: Any, x: Any, axes: Any, out: Any) -> None:
-    """Add D^T diag(B_e) D x; the length of `axes` tells the compiler the dimension."""
-    for e in range(len(edges)):
-        i, j = edges[e, 0], edges[e, 1]
-        for a in range(len(axes)):
-            pull = 0.0
-            for b in range(len(axes)):
-                pull += blocks[e, a, b] * (x[i, b] - x[j, b])
-            out[i, a] += pull
-            out[j, a] -= pull

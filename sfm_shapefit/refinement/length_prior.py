@@ -68,14 +68,21 @@ def _average(around: Any, of_pairs: Any, sizes: Any, means: Any, found: Any) -> 
     pointers, neighbors, edge_of = around
     size = 0
     for step in range(sizes[-1] + 1):
-        before, now = means[(step + 1) % 2], means[step % 2]
+        now = step % 2
+        before = 1 - now
         for i in range(len(pointers) - 1):
             degree = pointers[i + 1] - pointers[i]
-            for k in range(now.shape[1]):
-                total = 0.0
+            for k in range(means.shape[2]):
+                total, mean = 0.0, 0.0
+                if step > 0:
+                    mean = means[before, i, k]
                 for p in range(pointers[i], pointers[i + 1]):
-                    total += of_pairs[edge_of[p], k] if step == 0 else before[i, k] - before[neighbors[p], k]
-                now[i, k] = total / degree if step == 0 else before[i, k] - 0.5 * total / degree
+                    if step == 0:
+                        total += of_pairs[edge_of[p], k]
+                    else:
+                        total += mean - means[before, neighbors[p], k]
+                mean = total / degree if step == 0 else mean - 0.5 * total / degree
+                means[now, i, k] = mean
                 if step == sizes[size]:
-                    found[size, k] += degree * now[i, k] ** 2
+                    found[size, k] += degree * mean**2
         size += step == sizes[size]

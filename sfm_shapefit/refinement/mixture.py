@@ -487,7 +487,7 @@ class Mixture:
 
     def _propagate(self, at: _Residuals) -> FloatArray:
         """Return the variance of each residual by that of the locations, (m, d - 1), rad^2."""
-        inverse, variances = self._factor.selected_inverse(self._graph.edges), np.empty_like(self._own)
+        inverse, variances = self._factor.selected_inverse(), np.empty_like(self._own)
         edges, nodes = self._graph.edges, inverse.nodes
 
         def job(of: slice) -> None:

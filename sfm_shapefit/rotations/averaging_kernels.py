@@ -205,20 +205,6 @@ def follow_tree(order: Any, parents: Any, links: Any, pairs: Any, measured: Any,
 
 
 @kernel
-def apply_blocks(pairs: Any, blocks: Any, ridge: float, x: Any, out: Any) -> None:
-    """Fill out (n, 3) with (D^T B D + ridge I) x, blocks (k, 3, 3)."""
-    for i in range(len(x)):
-        out[i, 0], out[i, 1], out[i, 2] = ridge * x[i, 0], ridge * x[i, 1], ridge * x[i, 2]
-    for e in range(len(pairs)):
-        i, j, b = pairs[e, 0], pairs[e, 1], blocks[e]
-        d0, d1, d2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
-        for a in range(3):
-            pulled = b[a, 0] * d0 + b[a, 1] * d1 + b[a, 2] * d2
-            out[i, a] += pulled
-            out[j, a] -= pulled
-
-
-@kernel
 def move_to_modes(
     pointers: Any, neighbors: Any, edge_of: Any, pairs: Any, measured: Any, turns: Any, weights: Any,
     scale: float, margin: float,

@@ -24,9 +24,9 @@ from sfm_shapefit.laplacian.approximate import (
     diagonal_suffices,
 )
 from sfm_shapefit.laplacian.factor import Factor, FactorPlan, allocate_factor, analyze
-from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
+from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency, apply_blocks
 from sfm_shapefit.laplacian.ordering import best_order, widest_level
-from sfm_shapefit.rotations.averaging_kernels import add_at_ends, apply_blocks
+from sfm_shapefit.rotations.averaging_kernels import add_at_ends
 
 RIDGE = 1e-9
 """Share of the mean diagonal that is added to it; holds cameras whose pairs are all left out."""
@@ -101,8 +101,8 @@ class AveragingSystem:
         ridge = RIDGE * 2.0 * float(mean_eigenvalues(blocks).sum()) / self.num_nodes
 
         def apply(x: FloatArray) -> FloatArray:
-            out = np.empty((self.num_nodes, 3))
-            apply_blocks(self.pairs, blocks, ridge, np.ascontiguousarray(x), out)
+            out = ridge * np.ascontiguousarray(x)
+            apply_blocks(self.pairs, blocks, np.ascontiguousarray(x), (0, 1, 2), out)
             return out
 
         return apply
@@ -122,7 +122,7 @@ class AveragingSystem:
 
     def is_definite(self, diagonal: FloatArray, blocks: FloatArray) -> bool:
         """Return whether blocks (n, 3, 3), and (k, 3, 3) at (i, j) of pairs, make a definite matrix."""
-        return self._factor_of(3).refactor_blocks(self.pairs, diagonal, blocks)
+        return self._factor_of(3).refactor_blocks(diagonal, blocks)
 
     def _factor_of(self, block: int) -> Factor:
         assert self.plan is not None

@@ -102,7 +102,7 @@ def _factored(
 ) -> tuple[FloatArray, FloatArray]:
     """Return a third of the trace of P L^+ P at each camera, (n,), and the leverage of each pair, (k,)."""
     factor = system.ground_blocks(last.blocks)
-    inverse = factor.selected_inverse(system.pairs)
+    inverse = factor.selected_inverse()
     i, j = system.pairs.T
     difference = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
     leverages = np.einsum("kab,kab->k", last.blocks, difference) / 3.0

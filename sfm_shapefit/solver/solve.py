@@ -183,7 +183,7 @@ def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
         from sfm_shapefit.solver.conic import solve_conic
 
         return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit), "asked for")
-    resources = Resources(options.num_threads(), options.factor_bytes)
+    resources = Resources.of(options)
     if options.solver == "admm":
         return Choice("admm", partial(_split, resources, None), "asked for")
     predict = cache(partial(predict_factor, graph))

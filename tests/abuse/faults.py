@@ -104,7 +104,7 @@ class Bench:
             half.write(self.base / name)
         self.expected = warm_locate(self.base)["database"]
         self.writable = [self.folder, *caches()]
-        self.endings, self.before = Counter(), {}
+        self.endings, self.before, self._earlier = Counter(), {}, {}
         self.duration_s = min(self._time_a_sound_run() for _ in range(3))
 
     def _time_a_sound_run(self):
@@ -124,6 +124,16 @@ class Bench:
         for name in names:
             shutil.copytree(self.base / name, self.folder / name)
         self.before = fingerprint(self.folder)
+
+    def earlier(self, label):
+        """Return a folder with what another command writes where nothing is in its way; it runs once."""
+        if label not in self._earlier:
+            self.prepare("truth", "first", "second")
+            command = (label.split()[0], *_OTHERS[label])
+            run_forked(partial(command_line, command, self.folder / "tmp"), self.folder, self.writable)
+            kept = self.base.parent / f"earlier {label}"
+            self._earlier[label] = shutil.copytree(self.folder / "place", kept)
+        return self._earlier[label]
 
     def arguments(self, *extra, out="place/out"):
         return ("locate", "sparse/0", out, "--database", "database.db", "--threads", "1", *extra)
@@ -309,9 +319,7 @@ def no_room(rooms, on_disk, bench):
     """Other commands in a place without room, or whose files may not grow, also over an earlier output."""
     for label, arguments in _OTHERS.items():
         command = (label.split()[0], *arguments)
-        bench.prepare("truth", "first", "second")
-        run_forked(partial(command_line, command, bench.folder / "tmp"), bench.folder, bench.writable)
-        earlier = shutil.copytree(bench.folder / "place", bench.folder.parent / "earlier", dirs_exist_ok=True)
+        earlier = bench.earlier(label)
         size = sum(4096 + path.stat().st_size for path in earlier.rglob("*"))
         for pages, again in itertools.product((16, 4, 1, 2, 8)[:rooms], (False, True)):
             if again and label in ("synth", "convert"):  # folders of theirs are never replaced
@@ -326,7 +334,6 @@ def no_room(rooms, on_disk, bench):
                     shutil.copytree(earlier, bench.folder / "place", dirs_exist_ok=True)
                 main = partial(_run_limited, None if on_disk else room, (*command, *["--overwrite"] * again))
                 yield from _after_no_room(bench, main, f"{label}, {pages} pages, {again}")
-        shutil.rmtree(earlier)
 
 
 def _run_limited(most_bytes, command):

@@ -7,7 +7,7 @@ from importlib.metadata import version
 
 import numba
 import pytest
-from numba.core.codegen import JITCodeLibrary
+from numba.core.registry import cpu_target
 
 from harness.rooms import MODULES, tree_of
 
@@ -20,8 +20,13 @@ def numba_keeps_its_cache_there():
     return hasattr(numba.njit(count_references), "_cache")
 
 
-def numba_links_by_it():
-    return callable(JITCodeLibrary._get_module_for_linking)
+def numba_hands_code_to_it():
+    engine = cpu_target.target_context.codegen()._engine
+    return callable(engine._ee.add_object_file) and callable(engine.finalize_object)
+
+
+def numba_names_its_runtime_there():
+    return "MemInfo_call_dtor" in import_module("numba.core.runtime._nrt_python").c_helpers
 
 
 def numba_takes_the_option():
@@ -42,7 +47,8 @@ def scipy_has_superlu():
 
 SEEN = {
     "_cache": ("numba", "0.68.1", numba_keeps_its_cache_there),
-    "_get_module_for_linking": ("numba", "0.68.1", numba_links_by_it),
+    "_engine._ee": ("numba", "0.68.1", numba_hands_code_to_it),
+    "_nrt_python": ("numba", "0.68.1", numba_names_its_runtime_there),
     "_nrt": ("numba", "0.68.1", numba_takes_the_option),
     "_ufuncs": ("scipy", "1.17.1", scipy_has_ufuncs),
     "_flapack": ("scipy", "1.17.1", scipy_has_lapack),

@@ -98,7 +98,8 @@ def test_a_folder_without_the_images_is_told_and_a_graph_has_no_images_to_show(t
     assert "--images" in run("locate", "--help").stdout
     assert "--images" not in run("place", "--help-all").stdout
     graph = BUNDLED / "graph40.txt"
-    assert "No such option" in run("place", graph, tmp_path / "out", "--images", tmp_path, code=2).output
+    refused = run("place", graph, tmp_path / "out", "--images", tmp_path, code=2).output
+    assert "--images is an option of map, locate, join, check and synth" in refused
 
 
 def test_json_is_the_only_thing_on_stdout_and_equals_the_file_under_colmaps_own_names(tmp_path):
@@ -555,11 +556,21 @@ def test_a_key_that_the_command_does_not_know_is_explained(line, told, tmp_path)
 
 @pytest.mark.parametrize(
     ("command", "source", "flag", "owner"),
-    [("locate", RING_MODEL, "--gravity", "map"), ("map", RING / "database.db", "--fix", "locate")],
+    [
+        ("locate", RING_MODEL, "--gravity", "map"),
+        ("map", RING / "database.db", "--fix", "locate"),
+        ("check", RING_MODEL, "--trajectory", "evaluate"),
+        ("inspect", RING_MODEL, "--control-points", "locate, map and evaluate"),
+    ],
 )
 def test_a_flag_of_another_command_is_told_whose_it_is(command, source, flag, owner, tmp_path):
     said = run(command, source, tmp_path / "out", flag, "database", code=2).output
     assert f"{flag} is an option of {owner}" in " ".join(said.replace("│", " ").split())
+
+
+def test_check_says_how_points_are_compared_with_a_finished_model():
+    said = run("check", RING_MODEL, "--control_points", "gcp list.txt", code=2).output
+    assert f"sfm-shapefit evaluate {RING_MODEL} --control-points 'gcp list.txt'" in " ".join(said.split())
 
 
 def test_synth_makes_a_workspace_that_locate_takes(tmp_path):

@@ -1,5 +1,6 @@
 """`map IMAGES OUT`: photographs become a database, and the database a model."""
 
+import itertools
 import json
 import os
 import shutil
@@ -300,6 +301,31 @@ def test_images_are_matched_with_those_next_in_order_and_those_that_look_alike(d
     alike = alike_pairs(descriptors, 1)
     distances = np.linalg.norm(scene.centers[alike[:, 0]] - scene.centers[alike[:, 1]], axis=1)
     assert np.median(distances) <= 2.0 * np.linalg.norm(np.diff(scene.centers, axis=0), axis=1).max()
+
+
+def test_images_are_matched_with_those_nearest_by_position_whatever_their_order(drawn, tmp_path):
+    """They stand on a circle in another order than that of their names; the last one has no position."""
+    _, folder = drawn
+    names = sorted(os.listdir(folder / "images"))
+    order = [0, 5, 2, 7, 4, 1, 6, 3]
+    turns = 2.0 * np.pi * np.argsort(order) / len(order)
+    positions = np.column_stack(
+        [np.cos(turns), np.sin(turns), np.arange(8) % 2 * 100.0]
+    )  # heights say nothing
+    table = tmp_path / "gps.txt"
+    lines = [f"{name} {x} {y} {z}\n" for name, (x, y, z) in zip(names, positions.tolist(), strict=True)]
+    table.write_text("name x_m y_m z_m\n" + "".join(lines[:-1]))
+    told = {"pairing": "spatial", "overlap": 1, "max_num_features": 50}
+    with pytest.raises(InputError, match="no position prior of the model's images"):
+        sfm_shapefit.match_images(folder / "images", tmp_path / "a" / "database.db", **told)
+    made = sfm_shapefit.match_images(folder / "images", tmp_path / "b" / "database.db", priors=table, **told)
+    with pycolmap.Database.open(made) as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        near = [(names[i], names[j]) for i, j in itertools.pairwise([*order, order[0]]) if 7 not in (i, j)]
+        assert all(opened.exists_two_view_geometry(ids[a], ids[b]) for a, b in near)
+        assert opened.num_verified_image_pairs() < 28
+        last = [opened.exists_two_view_geometry(ids[names[-1]], ids[name]) for name in names[:-1]]
+        assert any(last)  # without a position, it is matched with those that look alike
 
 
 def test_alike_images_whose_names_have_spaces_are_refused_with_a_way_out(drawn, tmp_path):

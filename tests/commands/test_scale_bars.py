@@ -16,6 +16,7 @@ from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.cli import app
+from sfm_shapefit.commands.write import WRITERS
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.scale_bars import read_scale_bars
 from sfm_shapefit.scene.given import ScaleBars
@@ -252,9 +253,29 @@ def test_lengths_that_are_none_are_told(ring):
         few.delete_point3D(point)
     found = sfm_shapefit.evaluate_lengths(few, [("0001.jpg", "0002.jpg")])
     assert found.lengths == []
-    assert found.warnings[-1].startswith(
-        "nothing is known of the error of the distance of 0001.jpg and 0002.jpg"
-    )
+    unknown = "nothing is known of the error of the distance of 0001.jpg and 0002.jpg"
+    assert found.warnings[-1].startswith(unknown)
+    with pytest.raises(sfm_shapefit.UnsolvableError, match=unknown):
+        WRITERS.length(few, "0001.jpg", "0002.jpg")
+
+
+def test_a_result_tells_a_length_as_evaluate_does_whether_it_was_adjusted_or_not(
+    ring, ring_located, ring_mapped, tmp_path
+):
+    ends = ("0001.jpg", "0004.jpg")
+    plain = sfm_shapefit.locate(ring, RING / "database.db", adjust="none")
+    for found in (plain, ring_located, ring_mapped):
+        centers = [found.reconstruction.find_image_with_name(name).projection_center() for name in ends]
+        told = found.length(*ends)
+        assert told.length == pytest.approx(np.linalg.norm(centers[0] - centers[1]))
+        assert str(told).startswith(f"{told.length:.8f} ± "[:6])
+        assert "(95 %)" in str(told)
+    scaled = sfm_shapefit.map_database(RING / "database.db", scale_bars=written(tmp_path, lines_of(ring)))
+    told = scaled.length(*ends)  # of the largest model, with what it knows of its scale
+    assert told.has_scale
+    assert told == scaled.models[0].length(*ends)
+    with pytest.raises(InputError, match="no posed image nobody"):
+        plain.length("0001.jpg", "nobody.jpg")
 
 
 def test_a_model_whose_cameras_stand_in_one_place_is_told_of_without_errors(ring):

@@ -7,6 +7,7 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sfm_shapefit.base.record import dumps, write_json
@@ -70,6 +71,21 @@ def test_a_row_has_one_cell_per_axis_and_empty_cells_for_what_is_not_known(tmp_p
     assert [row.name for row in rows[1:]] == [row.name for row in rows.taken([1])] == ["c"]
     assert [row.name for row in rows.followed_by(rows)] == 2 * ['a,"b', "c"]
     assert (last.name, last.placed, last.piece, last.center) == ("c", False, None, ())
+
+
+def test_cells_far_down_a_table_are_quoted_where_they_need_it(tmp_path):
+    names = [f"{k}.jpg" for k in range(20_000)]  # more than are written together
+    names[3], names[-2], names[-1] = 'a,"b', "two\nlines", "a\rreturn"
+    told = {"name": names, "trust": [*np.linspace(0.0, 1.0, 19_999), np.inf], "piece": [None, *range(19_999)]}
+    write_rows(Table(CameraRow, 3, told), tmp_path / "cameras.csv")
+    header, *rows = lines_of(tmp_path / "cameras.csv")
+    assert [row[0] for row in rows] == names
+    trust = [row[header.index("trust")] for row in rows]
+    assert [float(cell) for cell in trust[:-1]] == told["trust"][:-1]
+    assert (trust[-1], rows[0][header.index("piece")], rows[-1][header.index("piece")]) == ("", "", "19998")
+    last = (tmp_path / "cameras.csv").read_bytes().splitlines(keepends=True)[-2:]
+    assert last[0] == b'"a\r'  # other programs end a line there unless all cells stand in quotes
+    assert last[1].startswith(b'return","false","","19998"')
 
 
 @pytest.mark.parametrize(("dimension", "axes"), [(2, ["vx", "vy"]), (4, ["vx1", "vx2", "vx3", "vx4"])])

@@ -28,6 +28,8 @@ from sfm_shapefit.pipeline.seed import seed_points
 from sfm_shapefit.pipeline.stages import set_gauge
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.scene.matches import is_among
+from sfm_shapefit.tracks.links import MatchedKeypoints
+from tests.judgement.test_lenses import NO_POINTS
 from tests.models import arrays, posed
 from tests.pipeline.made import FOLDER, opened, state_at
 from tests.problems import turn
@@ -163,3 +165,31 @@ def test_what_agrees_is_counted_among_the_cameras_that_stay():
     assert 3 <= found.images.is_posed.sum() <= 6
     assert found.support.observations == shares_at(found.images, found.points)
     assert found.support.observations.observations > 0.99
+
+
+def test_threads_that_share_very_many_matches_count_the_same():
+    per_image, rng = 120_000, np.random.default_rng(0)
+    images = read_model(RING / "sparse" / "0").images.part(np.arange(3))
+    xyz = rng.normal(0.0, 0.3, (per_image, 3)) + images.centers.mean(axis=0)
+    in_camera = np.einsum("iab,ixb->ixa", images.rotations, xyz - images.centers[:, None])
+    is_wrong = np.arange(per_image) < 20_000
+    in_camera[2, is_wrong, :2] += 0.5 * np.abs(in_camera[2, is_wrong, 2:])
+    rows = np.arange(3 * per_image).reshape(3, per_image)
+    pairs = np.concatenate([rows[[i, j]].T for i, j in ((0, 1), (0, 2), (1, 2), (1, 2))])
+    matched = MatchedKeypoints(
+        cameras=np.repeat(np.arange(3, dtype=np.int32), per_image),
+        keypoints=np.tile(np.arange(per_image, dtype=np.int32), 3),
+        pixels=np.zeros((3 * per_image, 2)),
+        on_plane=(in_camera[..., :2] / in_camera[..., 2:]).reshape(-1, 2),
+        matches=np.ascontiguousarray(pairs, dtype=np.uint32),
+    )
+    found = []
+    for threads in (1, 3):
+        counts = PartnerCounts(images, np.full(3, per_image), 4.0)
+        counts.add(matched, views_of(images).poses(images), threads)
+        told = counts.compare(NO_POINTS)
+        found.append([told.checked.tolist(), told.contradicting.tolist()])
+    assert found[0] == found[1]
+    assert found[0][0] == [per_image] * 3
+    assert 15_000 < found[0][1][2] <= 20_000
+    assert max(found[0][1][:2]) == 0

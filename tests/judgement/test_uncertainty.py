@@ -11,6 +11,7 @@ from sfm_shapefit.judgement.uncertainty import propagate
 from sfm_shapefit.pipeline import measure
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.synthetic import SceneOptions, box_graph_problem, make_scene
 from tests.scenes import RING
 
@@ -74,7 +75,9 @@ def test_points_are_judged_with_the_cameras_but_do_not_hold_the_gauge():
     found = propagate(*given, num_cameras=25)
     assert found.gauge.tolist() == [True] * 25 + [False] * 15
     assert np.isfinite(found.sigmas).all()
-    assert propagate(*given, max_bytes=1000) is None  # a factor beyond the limit is not tried
+    assert (
+        propagate(*given, resources=Resources(memory_bytes=1000)) is None
+    )  # a factor beyond the limit is not tried
 
 
 def test_independent_samples_scatter_like_the_inverse():

@@ -314,10 +314,30 @@ def test_threads_change_no_bit_of_a_factor_with_tasks_and_strips(divided, dtype)
         factor.refactor(w)
     for factor in factors[1:]:
         assert factor.smallest_pivot == factors[0].smallest_pivot
+        many = np.tile(rhs, 7)  # threads share these, and not the tree
+        np.testing.assert_array_equal(factor.solve(many), np.tile(factors[0].solve(rhs), 7))
         np.testing.assert_array_equal(factor.solve(rhs), factors[0].solve(rhs))
     matrix = laplacian_matrix(plan.num_nodes, edges, w)
     residual = np.linalg.norm(matrix @ factors[0].solve(rhs) - rhs) / np.linalg.norm(rhs)
     assert residual < 1e4 * np.finfo(dtype).eps  # 30 in float64, 1e3 in float32 (condition number 1e3)
+
+
+def test_a_matrix_of_blocks_that_are_not_symmetric_is_solved_whichever_way_its_edges_are_listed():
+    n, edges, _ = family("seq")
+    rng = np.random.default_rng(0)
+    edges = np.where(rng.random((len(edges), 1)) < 0.5, edges, edges[:, ::-1])
+    off_diagonal = rng.normal(size=(len(edges), 2, 2))
+    matrix = np.zeros((n, 2, n, 2))
+    matrix[edges[:, 0], :, edges[:, 1], :] = off_diagonal
+    matrix[edges[:, 1], :, edges[:, 0], :] = off_diagonal.transpose(0, 2, 1)
+    diagonal = np.tile(np.abs(matrix).sum(axis=(1, 2, 3)).max() * np.eye(2), (n, 1, 1))  # it dominates
+    matrix[np.arange(n), :, np.arange(n), :] = diagonal
+    factor, right = allocate_factor(analyze(n, edges), 2), rng.normal(size=(n, 2))
+    assert factor.refactor_blocks(diagonal, off_diagonal)
+    expected = np.linalg.solve(matrix.reshape(2 * n, 2 * n), right.ravel())
+    np.testing.assert_allclose(
+        factor.solve(right).ravel(), expected, rtol=0, atol=1e-13 * np.abs(right).max()
+    )
 
 
 def test_a_singular_graph_is_found_by_tasks_and_by_strips_alike(divided):
@@ -363,6 +383,12 @@ def test_workers_run_jobs_once_those_that_they_need_have_ended(threads):
     with pytest.raises(ValueError, match="job 12"):
         Workers(threads).run_after([job(k) for k in range(20)], needs)
     assert not {k for k in range(20) if 12 in needs[k]} & {*done}
+
+
+def test_jobs_may_hand_out_jobs_though_no_helper_is_free():
+    workers, done = Workers(2), []
+    workers.run([lambda: workers.run([lambda: done.append(1)] * 2)] * 4)
+    assert len(done) == 8
 
 
 def test_a_failure_ends_threads_that_wait_for_what_will_not_come():

@@ -17,7 +17,7 @@ def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
     edges = np.where(rng.random(len(edges))[:, None] < 0.5, edges, edges[:, ::-1])  # either way round
     weights = random_blocks(len(edges), b, seed=b)
     factor = factorize(analyze(n, edges), weights, ground=7.0)
-    found = factor.selected_inverse(edges)
+    found = factor.selected_inverse()
 
     matrix = laplacian_matrix(n, edges, weights).toarray().reshape(n, b, n, b)
     last = factor.plan.permutation[-1]
@@ -32,10 +32,10 @@ def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
 def test_entries_are_right_where_the_factor_is_cut_into_tasks_and_single_precision_is_refused():
     edges = trajectory_graph_problem(6000, 60.0, seed=0).edges
     with pytest.raises(ValueError, match="float64"):
-        factorize(analyze(6000, edges), np.ones(len(edges)), np.float32).selected_inverse(edges)
+        factorize(analyze(6000, edges), np.ones(len(edges)), np.float32).selected_inverse()
     factor = factorize(analyze(6000, edges), np.ones(len(edges)), ground=7.0)
     assert len(factor.plan.tasks) > 1
-    found = factor.selected_inverse(edges)
+    found = factor.selected_inverse()
     for node in range(0, 6000, 600):
         right = np.zeros((6000, 1))
         right[node] = 1.0
@@ -54,6 +54,6 @@ def test_entries_are_the_same_to_the_bit_for_any_number_of_threads(threads):
     for count in (1, threads):
         factor = allocate_factor(plan, 2, threads=count)
         factor.refactor(weights)
-        answers.append(factor.selected_inverse(edges))
+        answers.append(factor.selected_inverse())
     np.testing.assert_array_equal(answers[0].nodes, answers[1].nodes)
     np.testing.assert_array_equal(answers[0].edges, answers[1].edges)

@@ -6,6 +6,7 @@ import numpy as np
 
 from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.commands.map import map_database
+from sfm_shapefit.judgement.lens_residuals import lens_fields
 from sfm_shapefit.report.charts import residuals_of_states
 from sfm_shapefit.report.drawing import PairClass, input_centers
 from sfm_shapefit.report.results import draw_result
@@ -27,6 +28,14 @@ def test_what_is_drawn_of_a_result_is_what_its_facts_count():
     assert int(np.sum(drawing.pairs.classes == PairClass.CONTRADICTS)) == facts.pairs["outlier"]
     assert np.isfinite(drawing.cameras.poses.rotations[drawing.cameras.placed]).all()
     assert len(drawing.points.xyz) > 0
+
+
+def test_the_residuals_of_a_lens_that_are_drawn_are_those_of_the_verdict_and_of_the_output():
+    found = locate(RING / "sparse" / "0", RING / "database.db")
+    (drawn,), (anew,) = draw_result(found).fields, lens_fields(found.seed.structure)
+    assert drawn is found.evidence.fields[0]
+    assert all(np.array_equal(one, other) for one, other in zip(drawn, anew, strict=True))
+    assert "fields" not in found.facts.summary()["evidence"]
 
 
 def test_map_is_not_compared_with_positions_that_no_database_has():

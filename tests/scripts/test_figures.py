@@ -15,7 +15,8 @@ import report_picture
 from make_data import SCENES
 from paper import noise_robustness, phase_transition, theory_plot
 from paper.trials import METHODS, Cell, run_batch, run_trials
-from sfm_shapefit.synthetic import draw_image, make_rendered_scene
+from sfm_shapefit.synthetic import make_rendered_scene
+from sfm_shapefit.synthetic.rendering import encode_images
 from tests.program import run
 from tests.scenes import PHOTOGRAPHED, ROOT
 
@@ -123,8 +124,8 @@ def test_the_pictures_of_the_report_say_what_the_report_says_today(tmp_path, mon
     monkeypatch.chdir(tmp_path)
     images = Path("yard/images")
     images.mkdir(parents=True)
-    for k in range(scene.num_images):
-        Image.fromarray(draw_image(scene, k)).save(images / f"{k + 1:04d}.jpg")
+    for k, picture in enumerate(encode_images(scene), start=1):
+        (images / f"{k:04d}.jpg").write_bytes(picture)
     shutil.copy(PHOTOGRAPHED / "database.db", "yard")
     run("map", "yard/database.db", "yard_mapped", "--images", images, code=0)
     report_picture.main(["yard_mapped", "made.png"])

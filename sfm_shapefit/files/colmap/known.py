@@ -28,14 +28,19 @@ def read_known(
 ) -> Known:
     """Return what files tell of images: priors, points, bars and gravity, as far as asked for."""
     return Known(
-        priors=None if priors is None else _read_priors(images, file, priors),
+        priors=None if priors is None else read_priors(images, file, priors),
         control=_read_control(images, control_points) if control_points else None,
         bars=read_scale_bars(Path(scale_bars), images) if scale_bars else None,
         gravity=_read_gravity(images, file, gravity) if gravity else None,
     )
 
 
-def _read_priors(images: Images, file: DatabaseFile | None, source: Path | str) -> PositionPriors:
+def read_priors(images: Images, file: DatabaseFile | None, source: Path | str) -> PositionPriors:
+    """Read position priors of a table, of EXIF data in a folder, or of the database where the source says so.
+
+    Raises:
+        InputError: if the source cannot be read, or has no position of these images.
+    """
     from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors  # few are given
 
     if str(source) == OF_DATABASE:

@@ -4,6 +4,7 @@ Images and lenses are written first, in the order of their names, so that ids do
 ends first. What the database has already is not made again: a run that was interrupted goes on.
 """
 
+import json
 import os
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
@@ -20,12 +21,14 @@ from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.paths import PICTURES, TAKE_FRAMES, VIDEOS, refuse_no_folder
+from sfm_shapefit.base.record import write_json
+from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.files.colmap.bitmaps import earth_position, read_bitmap
 from sfm_shapefit.files.colmap.intrinsics import fisheye_guess
 from sfm_shapefit.files.colmap.quiet import quiet_log, quiet_stderr
 from sfm_shapefit.files.colmap.reconstructions import bytes_of_name, name_of
-from sfm_shapefit.files.matching_options import MatchingOptions
+from sfm_shapefit.files.matching_options import MATCHING_FILE, MatchingOptions
 from sfm_shapefit.files.model_folder import model_folders
 
 _UNREADABLE = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", *VIDEOS})
@@ -376,3 +379,22 @@ def _write_image(database: pycolmap.Database, name: str, lens: pycolmap.Camera, 
             corr_data_id=image.data_id,
         )
         database.write_pose_prior(prior)
+
+
+def remember_options(database: Path, options: MatchingOptions) -> None:
+    """Write with which options a database is made; InputError if it was begun with others or elsewhere."""
+    record, told = database.with_name(MATCHING_FILE), flat_values(options)
+    told |= {name: told[name] and os.path.abspath(told[name]) for name in ("mask_path", "rig_config_path")}
+    if not database.exists():
+        return write_json(told, record)
+    try:
+        before = json.loads(record.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InputError(
+            f"{database} was not made of images by this program; map it as it is, or choose another place"
+        ) from None
+    if others := [f"{name}={before.get(name)!r}" for name in told if before.get(name) != told[name]]:
+        raise InputError(
+            f"{database} was begun with {', '.join(others)}; give the same options, or another place"
+        )
+    return None

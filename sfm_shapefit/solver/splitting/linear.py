@@ -24,6 +24,7 @@ from sfm_shapefit.laplacian.factor import DEFAULT_FACTOR_BYTES, LaplacianFactor,
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.ordering import widest_level
 from sfm_shapefit.laplacian.symbolic import EliminationTree
+from sfm_shapefit.solver.solver_options import SolverOptions
 
 # A solve by approximate Cholesky costs about 9 us per edge in all (5 set-ups, 40 x 3 steps), five float32
 # factorizations at 80 Gflop/s as much from 150,000 operations per edge on. Geometric and community graphs of
@@ -50,6 +51,11 @@ class Resources(NamedTuple):
     """What one factor may take, predicted before it is allocated."""
     factor: LaplacianFactor | None = None
     """A solver for the graph's Laplacian that may be overwritten, where there is one already."""
+
+    @classmethod
+    def of(cls, options: SolverOptions) -> "Resources":
+        """Return what options allow."""
+        return cls(options.num_threads(), options.factor_bytes)
 
 
 ONE_THREAD = Resources()
