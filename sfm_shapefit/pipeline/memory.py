@@ -52,7 +52,7 @@ _KEPT_BYTES, _ENTRY_BYTES = 75.0, 150.0
 _OVERSHOT = 1.2  # observations of few tracks for each that an image wants; 1.13 measured
 _THIN_PAIRS, _THIN_FACTOR = 1.9, 1.9
 """Pairs of cameras that meet in few tracks, for each of the graph; blocks of their factor, likewise."""
-_ITERATIVE_BYTES = 70e3  # bytes of a camera; the factors of its blocks and of the coarse system
+_ITERATIVE_BYTES = 40e3  # bytes of a camera; the factors of its blocks and of the coarse system
 _AVERAGED_BLOCKS, _AVERAGED_FACTORS = 10.0, 1.2
 """Blocks that averaging holds for each pair; for each block of the factor too, with its update matrices."""
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000  # unknowns of an adjusted camera; up to as many, their system is dense
