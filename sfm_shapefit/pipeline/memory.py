@@ -212,7 +212,7 @@ def _adjusted_thinly(work: Workload, plan: MemoryPlan) -> tuple[float, float]:
     if plan.divides or work.num_images > MOST_WHOLE:
         return observations, system + _ITERATIVE_BYTES * work.num_images
     # The factor has numbers of 32 bits; up to so many frames one of 64 follows, with its selected inverse.
-    copies = 2.2 if work.num_images <= MOST_FRAMES else 0.5
+    copies = 2.0 if work.num_images <= MOST_FRAMES else 0.5
     solving = system + copies * block * _THIN_FACTOR * work.factor_entries
     return observations, max(entries, solving) if observations > MANY_ENTRIES else entries + solving
 
