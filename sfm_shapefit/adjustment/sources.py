@@ -178,7 +178,8 @@ def _look_up(
             if not lens.is_adjustable:
                 pixels = lens.focal_px * on_plane[own]
             cameras[own] += view
-        seen[own] = pixels
+        with np.errstate(over="ignore"):  # then 32 bits do not do
+            seen[own] = pixels
         return np.array_equal(seen[own], pixels, equal_nan=True)
 
     runs = lens_runs(images.lens_of, np.diff(ends))

@@ -152,7 +152,7 @@ def _run_with_other_offsets(
     is_moved = (offsets != images.sensors.translations).any() and not inputs.fixed.any()
     for rigs in ways if is_moved else ():
         start = with_offsets(_with_rigs(inputs, rigs), source, offsets)
-        with suppress(InputError, UnsolvableError):  # then what there is already stays
+        with suppress(InputError, UnsolvableError):  # the first result, or error, stays
             result = _run_in_scale(*start, clock)
             if isinstance(result, LocateResult) and result.kept.sum() >= least:
                 doubt = f"{wrong[0]}, so sensors are placed by these matches, as far away as the rig has them"

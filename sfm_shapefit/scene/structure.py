@@ -39,9 +39,11 @@ class Structure:
         for image, rows in enumerate(self.rows_of_images):
             if len(rows):
                 pixels = self.pictures.pixels(image, self.points.keypoints[rows])
-                if not np.array_equal(pixels.astype(stored.dtype), pixels, equal_nan=True):
+                with np.errstate(over="ignore"):
+                    stored[rows] = pixels
+                if not np.array_equal(stored[rows], pixels, equal_nan=True):  # 32 bits do not do
                     stored = stored.astype(np.float64)
-                stored[rows] = pixels
+                    stored[rows] = pixels
         return Widened(stored)
 
     def has_keypoints_of(self, view: View) -> bool:
