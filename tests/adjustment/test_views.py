@@ -245,7 +245,8 @@ def test_matches_of_several_lenses_are_collected_batch_by_batch_by_any_number_of
         for pair, keypoints in zip(every, own, strict=True)
     ]
     place = np.where(np.arange(images.num_images) == 2, -1, np.arange(images.num_images))
-    found = collect_matches(images, pictures, place, batches, 6 * len(batches), threads)
+    room = np.empty((6 * len(batches), 2), dtype=np.uint32)
+    found = collect_matches(images, pictures, place, batches, room, threads)
 
     at = np.stack([found.cameras, found.keypoints], axis=1)
     expected = [
