@@ -150,7 +150,7 @@ def check_command(
             told = found.facts.told(found.cameras, found.pairs)
             print_answer(told)
             written = "" if report is None else f"written to {report}; open {shlex.quote(str(report))}"
-            print_ending(found.verdict.grade.value, found.verdict.statement, written, told.step)
+            print_ending(found.verdict.grade.value, found.facts.told_verdict, written, told.step)
         if strict:
             _be_strict(is_usable=found.verdict.is_usable, has_matches=found.facts.has_matches)
 

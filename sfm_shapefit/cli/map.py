@@ -118,10 +118,10 @@ def _match(
     from sfm_shapefit.pipeline.components import read_beside
 
     clock = Clock.of(run.progress, run.options.placement.solver.threads)
-    begun, notes = begin_database(images, database, read_options(MatchingOptions, given), clock)
+    begun, notes = begin_database(images, database, read_options(MatchingOptions, given), clock, priors)
     with closing(DatabaseFile(database)) as file:  # what cannot be used is refused before the long work
         _, _, known = read_beside(file, read_images(file).images, run.options, priors)
-    match_begun(begun, clock, priors)
+    notes += match_begun(begun, clock, priors)
     run.flags = replace(run.flags, images=run.flags.images or str(images))
     return known, notes
 

@@ -50,7 +50,7 @@ class CheckResult(Reported, Stated):
         return replace(self, facts=replace(self.facts, scale_bars=bars.rows(), warnings=warnings))
 
     def _headline(self) -> str:
-        return f"{self.facts.num_placed} of {self.facts.num_images} images, {self.verdict.statement}"
+        return f"{self.facts.num_placed} of {self.facts.num_images} images, {self.facts.told_verdict}"
 
 
 def checked_pair_rows(images: Images, fits: PairFits | None) -> Table[PairRow]:

@@ -172,8 +172,11 @@ class FactsOfModel(Facts):
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
     evidence: Annotated[ModelEvidence, "What speaks against the model although it fits."] = ModelEvidence()
 
-    def told_lines(self, against: tuple[int, int], more: str = "") -> list[str]:
-        """Return the answer in lines: how many pairs are `against` it, of how many, and `more` of matches."""
+    def told_lines(self, against: tuple[int, int], more: str = "", num_rejected: int = 0) -> list[str]:
+        """Return the answer in lines: how many pairs are `against` it, of how many, and `more` of matches.
+
+        Further pairs are rejected, as their matches contradict the rotations.
+        """
         error_px = self.mean_reprojection_error_px
         points = f", mean reprojection error {in_pixels(error_px, 2)}" if error_px is not None else ""
         source = from_here(self.inputs.database) if self.inputs.database else self.inputs.directions
@@ -181,7 +184,10 @@ class FactsOfModel(Facts):
             f"{against[0]:,} of {counted(against[1], 'pair')} contradict{'s' * (against[1] == 1)} the result"
         )
         contradict = contradict if against[1] else "no pair determines where cameras are"
-        silent = self.num_pairs - against[1]
+        if num_rejected:
+            others = f"{num_rejected:,}{' more' * bool(against[1])} contradict{'s' * (num_rejected == 1)}"
+            contradict += f", and {others} its rotations"
+        silent = self.num_pairs - against[1] - num_rejected
         if silent > against[1] > 0:
             contradict += f", and {silent:,} of {self.num_pairs:,} pairs say nothing of it"
         return [
@@ -359,6 +365,12 @@ class CheckedFacts(FactsOfModel):
         return bool(self.inputs.database or self.images)
 
     @property
+    def told_verdict(self) -> str:
+        """The verdict in words; a good one names what its evidence cannot show."""
+        is_alone = self.verdict.grade is Grade.GOOD and not self.has_matches
+        return self.verdict.statement + ", by its own tracks alone, which cannot show a fold" * is_alone
+
+    @property
     def next_step(self) -> NextStep:
         """What to do next, with the folder of the pictures where it is known."""
         return self._next().at(images=from_here(self.images) if self.images else "IMAGES")
@@ -427,7 +439,9 @@ class CheckedFacts(FactsOfModel):
         weak = [f"{row.name}: {row.reason}" for row in doubted if row.reason]
         absent = first_of([row.name for row in cameras if not row.placed])
         judged = np.isfinite(pairs.columns["direction"]).all(axis=1)  # the others say nothing of positions
-        lines = self.told_lines((int(np.sum(contradicting(pairs) & judged)), int(judged.sum())))[:2]
+        against, num_rejected = contradicting(pairs), int(np.sum(contradicting(pairs) & ~judged))
+        counts = int(np.sum(against & judged)), int(judged.sum())
+        lines = self.told_lines(counts, num_rejected=num_rejected)[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
         notes = Row("warning", [one for one in self.warnings if one not in self.evidence.statements])
         bars = row("scale bars", describe_scale_bars(self.scale_bars))

@@ -74,7 +74,9 @@ def read_beside(
         InputError: if a file cannot be used, or an option is not for these images.
     """
     if options.freedom.rigs == "free" and not images.has_rigs:
-        raise InputError(f"{file.path} has no rig of several cameras to refine; leave out rigs=free")
+        raise InputError(
+            f"{file.path} has no rig of several cameras with poses to refine; leave out rigs=free"
+        )
     inputs = read_left_out(inputs_from(file.path), images.names, options.directions.without)
     gauge = between_images(options.gauge, images.names, "the database has no image")
     options, gravity = replace(options, gauge=gauge), options.averaging.gravity

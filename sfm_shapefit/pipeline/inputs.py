@@ -216,22 +216,30 @@ def choose_inputs(
 def inputs_to_check(model: ModelSource, database: Path | str | None) -> Inputs:
     """Return the same for `check`: without a database, an output is judged by the one that it was made of."""
     inputs = choose_inputs(model, database)
-    own = _database_of_output(inputs.folder) if inputs.folder and inputs.database is None else None
-    if own is None:
+    if inputs.folder is None or inputs.database is not None:
+        return inputs
+    own = told_of(inputs.folder, "inputs", lambda found: Path(found.get("database")))
+    if own is None or not own.is_absolute():
+        return inputs
+    if not own.exists():
+        statement = (
+            f"the model's own tracks, which cannot show a fold; {own}, which it was made from, is gone: give "
+            "its new place (database=FILE)"
+        )
+        return replace(inputs, statement=statement)
+    if not _has_all_images(own, inputs.folder):
         return inputs
     statement = f"inlier matches of {own} (which the model's locate.json names)"
     return replace(inputs, database=own, statement=statement, is_found=True)
 
 
-def _database_of_output(folder: Path) -> Path | None:
-    """Return the database that an output names, if it is there and has all images of it; else None."""
+def _has_all_images(database: Path, output: Path) -> bool:
+    """Return whether a database can be read and has all images of an output."""
     with suppress(InputError):
-        path = told_of(folder, "inputs", lambda found: Path(found.get("database")))
-        if path is not None and path.is_absolute() and path.is_file():
-            names = sorted(read_trust(folder / "cameras.csv"))
-            with closing(DatabaseFile(path)) as file:
-                return path if {*range(len(names))} <= {*match_names(file, names).values()} else None
-    return None
+        names = sorted(read_trust(output / "cameras.csv"))
+        with closing(DatabaseFile(database)) as file:
+            return {*range(len(names))} <= {*match_names(file, names).values()}
+    return False
 
 
 def inputs_from(database: Path) -> Inputs:

@@ -195,7 +195,7 @@ def test_a_model_that_nothing_speaks_for_does_not_pass_strict(tmp_path):
     judged = run("check", alone, "--strict", code=4).stdout
     assert "verdict: cannot be judged: it has no 3D points, and no database was given or found" in judged
     tracks = run("check", shutil.copytree(model, tmp_path / "tracks"), "--strict", code=4)
-    assert tracks.stdout.splitlines()[2] == "verdict: good"
+    assert tracks.stdout.splitlines()[2].startswith("verdict: good, by its own tracks alone")
     assert "by its own tracks alone, which cannot show a fold" in " ".join(tracks.stderr.split())
     run("check", model, "--strict", "--no-second-opinion", "-q", code=0)
     strangers = spoiled(tmp_path / "strangers", names="other-{}".format)
@@ -215,7 +215,10 @@ def test_an_output_is_judged_by_the_database_that_it_names_while_that_has_its_im
     edit_database(database, "UPDATE images SET name = 'other_' || name WHERE image_id = 1")
     assert not check(tmp_path / "far/below/0").facts.has_matches
     Path(database).unlink()
-    assert not check(tmp_path / "far/below/0").facts.has_matches
+    alone = check(tmp_path / "far/below/0")
+    assert not alone.facts.has_matches
+    assert f"{database}, which it was made from, is gone" in alone.facts.inputs.directions
+    assert "good, by its own tracks alone" in repr(alone)
 
 
 def test_an_output_names_its_database_so_that_it_is_found_from_any_folder(tmp_path, monkeypatch):
@@ -238,7 +241,11 @@ def test_an_output_names_its_database_so_that_it_is_found_from_any_folder(tmp_pa
 
 def test_a_model_beside_another_scenes_database_is_doubted():
     """Names are common, and so are some pairs by chance; a model's own points tie its cameras too."""
-    told = check(PHOTOGRAPHED / "truth", RING / "database.db", second_opinion=False).verdict
+    found = check(PHOTOGRAPHED / "truth", RING / "database.db", second_opinion=False)
+    told, (_, matches) = found.verdict, found.facts.told(found.cameras, found.pairs).lines
+    counts = re.search(r"(\d+) of \1 pairs contradict the result, and (\d+) more contradict its", matches)
+    assert counts is not None
+    assert f"{sum(map(int, counts.groups()))} pairs contradict it" in told.statement
     assert told.grade != "good"
     assert "contradict it and none agrees: is this the model's database?" in told.statement
 

@@ -265,7 +265,10 @@ def test_images_become_sensors_of_the_rigs_of_a_file_also_those_that_are_added(d
         (pose,) = [pose for rig in opened.read_all_rigs() for pose in rig.non_ref_sensors.values()]
     np.testing.assert_array_equal(pose.translation, [-0.5, 0.0, 0.0])
     config.write_text(json.dumps([{"cameras": [sensors[0], {"image_prefix": "right_"}]}]))
-    unknown = sfm_shapefit.match_images(images, tmp_path / "b.db", rig_config_path=str(config), **few)
+    with pytest.warns(
+        UserWarning, match="rigs.json: no cam_from_rig_rotation and cam_from_rig_translation for right_"
+    ):
+        unknown = sfm_shapefit.match_images(images, tmp_path / "b.db", rig_config_path=str(config), **few)
     assert rigs_of(unknown) == rigs_of(made)
     with pycolmap.Database.open(unknown) as opened:
         assert [pose for rig in opened.read_all_rigs() for pose in rig.non_ref_sensors.values()] == [None]
@@ -275,7 +278,7 @@ def test_images_become_sensors_of_the_rigs_of_a_file_also_those_that_are_added(d
     ("text", "why"),
     [
         ("[{", "no file of rigs as COLMAP's rig_configurator takes"),
-        ('[{"cameras": [{"image_prefix": "0"}]}]', "must have one reference sensor"),
+        ('[{"cameras": [{"image_prefix": "0"}]}]', 'give exactly one camera of each rig "ref_sensor": true'),
         ('[{"cameras": [{"image_prefix": "b/", "ref_sensor": true}]}]', "no image begins with b/"),
     ],
 )
@@ -316,16 +319,20 @@ def test_images_are_matched_with_those_nearest_by_position_whatever_their_order(
     lines = [f"{name} {x} {y} {z}\n" for name, (x, y, z) in zip(names, positions.tolist(), strict=True)]
     table.write_text("name x_m y_m z_m\n" + "".join(lines[:-1]))
     told = {"pairing": "spatial", "overlap": 1, "max_num_features": 50}
-    with pytest.raises(InputError, match="no position prior of the model's images"):
+    with pytest.raises(InputError, match=r"needs positions, and the EXIF .* have none; give a table"):
         sfm_shapefit.match_images(folder / "images", tmp_path / "a" / "database.db", **told)
-    made = sfm_shapefit.match_images(folder / "images", tmp_path / "b" / "database.db", priors=table, **told)
+    assert not (tmp_path / "a").exists()
+    with pytest.warns(UserWarning, match="1 of 8 images has no position.* matched with all others"):
+        made = sfm_shapefit.match_images(
+            folder / "images", tmp_path / "b" / "database.db", priors=table, **told
+        )
     with pycolmap.Database.open(made) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         near = [(names[i], names[j]) for i, j in itertools.pairwise([*order, order[0]]) if 7 not in (i, j)]
         assert all(opened.exists_two_view_geometry(ids[a], ids[b]) for a, b in near)
         assert opened.num_verified_image_pairs() < 28
         last = [opened.exists_two_view_geometry(ids[names[-1]], ids[name]) for name in names[:-1]]
-        assert any(last)  # without a position, it is matched with those that look alike
+        assert all(last)
 
 
 def test_alike_images_whose_names_have_spaces_are_refused_with_a_way_out(drawn, tmp_path):

@@ -304,7 +304,7 @@ def _read_rigs(options: MatchingOptions) -> list[pycolmap.RigConfig]:
     """Read the rigs of the options; none where they name no file.
 
     Raises:
-        InputError: if pycolmap cannot read the file.
+        InputError: if pycolmap cannot read the file, or a rig has not one reference sensor.
     """
     if not options.rig_config_path:
         return []
@@ -315,11 +315,13 @@ def _read_rigs(options: MatchingOptions) -> list[pycolmap.RigConfig]:
         with quiet_log():
             return list(pycolmap.read_rig_config(path))
     except (RuntimeError, ValueError) as error:
+        if "reference sensor" in str(error):
+            raise InputError(f'{path}: give exactly one camera of each rig "ref_sensor": true') from None
         raise InputError(f"{path} is no file of rigs as COLMAP's rig_configurator takes: {error}") from None
 
 
-def refuse_rigs(options: MatchingOptions, names: Sequence[str]) -> None:
-    """Refuse rigs that these images cannot be.
+def check_rigs(options: MatchingOptions, names: Sequence[str]) -> list[str]:
+    """Refuse rigs that these images cannot be; return notes on sensors without a pose.
 
     Raises:
         InputError: if no image begins with a sensor's prefix.
@@ -328,6 +330,10 @@ def refuse_rigs(options: MatchingOptions, names: Sequence[str]) -> None:
     for prefix in _prefixes_of(rigs):
         if not any(name.startswith(prefix) for name in names):
             raise InputError(f"{path}: no image begins with {prefix}; the first is {names[0]}")
+    sensors = [sensor for rig in rigs for sensor in rig.cameras]
+    lost = [str(one.image_prefix) for one in sensors if not (one.ref_sensor or one.cam_from_rig)]
+    why = f"{path}: no cam_from_rig_rotation and cam_from_rig_translation for {first_of(lost)}; the images"
+    return [f"{why} are placed one by one"] if lost else []
 
 
 def _prefixes_of(rigs: Sequence[pycolmap.RigConfig]) -> list[str]:
