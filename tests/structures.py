@@ -72,8 +72,8 @@ def matches_between(model, image_ids, batches):
     """The matches of the posed images of a model; pairs of the batches index `image_ids`."""
     images = posed_images(model)
     place = np.array([np.flatnonzero(images.ids == i).max(initial=-1) for i in image_ids.tolist()])
-    num_matches = sum(len(batch.keypoints) for batch in batches)
-    return collect_matches(images, pictures_of(model, images), place, batches, num_matches)
+    room = np.empty((sum(len(batch.keypoints) for batch in batches), 2), dtype=np.uint32)
+    return collect_matches(images, pictures_of(model, images), place, batches, room)
 
 
 def filtered(model, options=None):

@@ -39,7 +39,7 @@ POINTS = {
         "sfm_shapefit.scene.matches:View.links",
         "sfm_shapefit.scene.matches:View.of_pairs",
     ),
-    "solves": ("sfm_shapefit.solver.certificate:certify",),
+    "solves": ("sfm_shapefit.solver.certificate:certify_as_asked",),
     "assessments": ("sfm_shapefit.judgement.verdicts:assess",),
     "openings": ("sqlite3:connect", "pycolmap:Database.open"),
     "conversions": (

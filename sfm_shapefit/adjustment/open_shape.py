@@ -64,9 +64,9 @@ def estimate_open_shape(
         return None
     try:
         run = begin(images, tracks, StructureOptions(), freedom, crew=Crew(threads))
-        tracks, found, problem = run.problem_of_all(checked=True)
+        seen, found, problem = run.problem_of_all(checked=True)
         run = replace(run, freedom=replace(run.freedom, noise_px=noise_px_of(problem)))
-        few = run.thin_problem(tracks, found, times=FINE_TIMES)
+        few = run.thin_problem(seen, found, times=FINE_TIMES)
         after, _ = run.solve(few, _FALL, settles_points=True)
         options = after.options_at_optimum()
         freed = freedom.apply(problem, None)

@@ -47,14 +47,14 @@ from sfm_shapefit.adjustment.solve import (
 )
 from sfm_shapefit.adjustment.sources import Links, with_rays_of
 from sfm_shapefit.adjustment.views import views_of
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IndexArray, hand_back_memory
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.executors import HERE, Crew
 from sfm_shapefit.base.threads import count_threads
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import FOCAL
 from sfm_shapefit.scene.points import Points
-from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
+from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks, SeenTracks
 from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.thin_tracks import choose_thin_tracks
 from sfm_shapefit.tracks.triangulation import (
@@ -127,9 +127,7 @@ class AdjustmentRun:
         of_lens = zip(self.images.lenses, self.freedom.lenses, strict=True)
         return any(is_free and lens.parameters != lens.given for lens, is_free in of_lens)
 
-    def triangulate(
-        self, widening: float, *, checked: bool = False
-    ) -> tuple[ObservedTracks, TriangulatedPoints]:
+    def triangulate(self, widening: float, *, checked: bool = False) -> tuple[SeenTracks, TriangulatedPoints]:
         """Return the tracks and points at the poses of the images.
 
         Args:
@@ -144,41 +142,47 @@ class AdjustmentRun:
         poses, threads = views_of(self.images).poses(self.images), count_threads(self.crew.threads)
         assert self.links is not None
         if isinstance(self.links, ObservedTracks):
-            joined, found = self.links, triangulate_tracks(self.links, poses, limits, threads)
-        else:
-            error_px = self.options.max_reprojection_error_px
-            joined, found = triangulate_matches(self.links, poses, limits, error_px, threads)
-        frames = self.images.frame_of[views_of(self.images).images[joined.cameras]]
-        return joined, without_lone_frames(found, frames, limits.min_length)
+            found = triangulate_tracks(self.links, poses, limits, threads)
+            return self.links, self._without_lone_frames(self.links, found, limits.min_length)
+        error_px = self.options.max_reprojection_error_px
+        joined, found = triangulate_matches(self.links, poses, limits, error_px, threads)
+        return joined, self._without_lone_frames(joined, found, limits.min_length)
 
-    def problem(self, tracks: ObservedTracks, found: TriangulatedPoints) -> AdjustmentProblem:
+    def _without_lone_frames(
+        self, joined: SeenTracks, found: TriangulatedPoints, least: int
+    ) -> TriangulatedPoints:
+        frames = self.images.frame_of[views_of(self.images).images].astype(np.int32)
+        return without_lone_frames(found, frames[joined.cameras[:]], least)
+
+    def problem(self, tracks: SeenTracks, found: TriangulatedPoints) -> AdjustmentProblem:
         """Return the problem of points that were triangulated from tracks, at the poses of the images."""
         sensors = self.freedom.sensors(self.images)
         return views_of(self.images).problem(self.images, sensors, self.given, tracks, found)
 
     def problem_of_all(
         self, *, checked: bool = False
-    ) -> tuple[ObservedTracks, TriangulatedPoints, AdjustmentProblem]:
+    ) -> tuple[SeenTracks, TriangulatedPoints, AdjustmentProblem]:
         """Return tracks and points at the pixel threshold, as `triangulate` does, and the problem of all."""
         joined, found = self.triangulate(1.0, checked=checked)
         refuse_without_points(len(found.points))
         return joined, found, self.problem(joined, found)
 
-    def share_of_frames(self, tracks: ObservedTracks, found: TriangulatedPoints) -> FloatArray:
+    def share_of_frames(self, tracks: SeenTracks, found: TriangulatedPoints) -> FloatArray:
         """Return the share of each frame's observations of triangulated tracks that fit the points, (n,)."""
-        frames = self.images.frame_of[views_of(self.images).images[tracks.cameras]]
+        frames = self.images.frame_of[views_of(self.images).images[tracks.cameras[:]]]
         track_of = tracks.list_of_rows()
         in_points, count = np.isin(track_of, found.tracks), len(self.images.frames.ids)
         fit, every = (np.bincount(frames[x], minlength=count) for x in (found.points_seen >= 0, in_points))
         return np.where(every > 0, fit / np.maximum(every, 1), 1.0)
 
     def thin_problem(
-        self, tracks: ObservedTracks, found: TriangulatedPoints, *, times: int = 1
+        self, tracks: SeenTracks, found: TriangulatedPoints, *, times: int = 1
     ) -> AdjustmentProblem:
         """Return the problem of few of the points found, or of some times as many."""
         refuse_without_points(len(found.points))
+        hand_back_memory()  # what points were made of
         thin = tracks.of_points(found.points_seen)
-        images = views_of(self.images).images[thin.cameras]
+        images = views_of(self.images).images.astype(np.int32)[thin.cameras[:]]
         chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, self.images.num_images, times)
         del images
         place = np.full(len(found.points), -1, dtype=np.int32)
@@ -341,7 +345,7 @@ class AdjustmentRun:
 Solved = tuple[AdjustmentRun, AdjustmentProblem]
 
 
-def without_lone_frames(found: TriangulatedPoints, frames: IntArray, least: int) -> TriangulatedPoints:
+def without_lone_frames(found: TriangulatedPoints, frames: IndexArray, least: int) -> TriangulatedPoints:
     """Return points of at least so many observations (m,), of which no frame (m,) has a single one.
 
     Where it may move, such a frame and its point run into another camera of that point: nothing is missed
@@ -349,7 +353,7 @@ def without_lone_frames(found: TriangulatedPoints, frames: IntArray, least: int)
     """
     while True:
         seen = found.points_seen >= 0
-        alone = seen & (np.bincount(frames[seen], minlength=int(frames.max(initial=0)) + 1)[frames] == 1)
+        alone = seen & (np.bincount(frames[seen], minlength=int(frames.max(initial=0)) + 1) == 1)[frames]
         if not alone.any():
             return found
         found = replace(found, points_seen=np.where(alone, -1, found.points_seen)).of_length(least)
@@ -437,22 +441,19 @@ def solve_thinly_again(run: AdjustmentRun) -> Solved:
 def problem_of_poses(run: AdjustmentRun) -> tuple[AdjustmentProblem | None, AdjustmentProblem | None]:
     """Return the fine problem; None where the points found say that poses are coarse, and the coarse one."""
     joined, found = run.triangulate(1.0)
-    checked = found.of_length(run.checked_length)
-    problem = run.thin_problem(joined, found, times=FINE_TIMES) if len(checked.points) else None
+    num_fine = found.count_seen(run.checked_length)
+    problem = run.thin_problem(joined, found, times=FINE_TIMES) if num_fine else None
     del joined, found  # whose arrays have all matches
-    coarse = _coarse_points(run, checked)
+    coarse = _coarse_points(run, num_fine)
     return (None, run.thin_problem(*coarse)) if coarse else (problem, None)
 
 
-def _coarse_points(
-    run: AdjustmentRun, fine: TriangulatedPoints
-) -> tuple[ObservedTracks, TriangulatedPoints] | None:
-    """Return the tracks and points at the wide limit; None if poses are fine, by those at the threshold.
+def _coarse_points(run: AdjustmentRun, num_fine: int) -> tuple[SeenTracks, TriangulatedPoints] | None:
+    """Return the tracks and points at the wide limit; None if so many observations say that poses are fine.
 
     They are not looked for where nine tenths of all matched keypoints see those at the threshold.
     """
     assert run.links is not None
-    num_fine = int(np.sum(fine.points_seen >= 0))
     if 0 < num_fine >= _FINE * len(run.links.cameras):
         return None
     joined, loose = run.triangulate(_THIN_LIMIT, checked=True)
@@ -535,7 +536,7 @@ def solve_known_points(run: AdjustmentRun, points: FloatArray) -> Solved:
 def solve_from_seed(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem, float]:
     """Return what `solve_by_all_points` does, after few where poses are coarse; and the first mean error."""
     joined, found = run.triangulate(1.0, checked=True)
-    coarse = _coarse_points(run, found)
+    coarse = _coarse_points(run, found.count_seen())
     initial_error_px = mean_error_px(run.problem(joined, found))
     if coarse is not None:
         run, _ = run.solve(run.thin_problem(*coarse), _THIN_FALL, _THIN_SCALE)

@@ -407,6 +407,7 @@ class _DividedRun(_Run):
         """Make the damped equations at the best values, and note their gradient."""
         self.made = self.how(self.damping)
         self.total = self.parts.linearize(self.values, self.made)
+        hand_back_memory()  # what the parts have sent, before the factor comes
         self.note_gradient(self.total.largest, largest_share(self.total.curvatures, self.total.gradients))
 
     def forget(self) -> None:

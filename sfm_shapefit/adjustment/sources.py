@@ -20,6 +20,7 @@ from sfm_shapefit.base.arrays import (
 from sfm_shapefit.base.executors import in_slices, in_threads, overlapped
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.lists import offsets_of
+from sfm_shapefit.base.row_file import AnyRows
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import KeypointMatches, lens_runs
 from sfm_shapefit.scene.points import Points
@@ -36,7 +37,7 @@ def collect_matches(
     pictures: KeypointRays,
     place: IntArray,
     batches: Iterable[KeypointMatches],
-    num_matches: int,
+    room: AnyRows,
     threads: int = 1,
 ) -> MatchedKeypoints:
     """Return all matches between posed images; batches are consumed one at a time.
@@ -46,14 +47,13 @@ def collect_matches(
         pictures: of the images.
         place: (n,) row in `images` of each image that the batches' pairs index; -1 for those to be left out.
         batches: matches.
-        num_matches: that the batches have at most.
+        room: (M, 2) rows for all matches that the batches may have, of a type for the numbers of all
+            keypoints; they take the most memory, if they are not in a file.
         threads: number of threads to share batches among; the answer does not depend on it.
     """
     counts = np.array([pictures.count(k) for k in range(images.num_images)], dtype=np.int64)
     begins = offsets_of(counts)
-    number = np.uint32 if begins[-1] < 2**32 else np.int64
-    # Memory is taken as rows are written; one array of each batch, to be joined, would take it twice.
-    room, is_matched = np.empty((num_matches, 2), dtype=number), np.zeros(int(begins[-1]), dtype=np.bool_)
+    is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
 
     def tasks() -> Iterator[tuple[KeypointMatches, BoolArray, int]]:
         end = 0
@@ -67,31 +67,35 @@ def collect_matches(
         ends, lengths, own = place[batch.pairs], batch.lengths(), batch.keypoints
         if not kept.all():
             ends, lengths, own = ends[kept], lengths[kept], own.compress(np.repeat(kept, lengths), axis=0)
-        numbers = room[begin : begin + len(own)]
+        numbers = np.empty(own.shape, dtype=room.dtype)
         np.add(own, np.repeat(begins[ends], lengths, axis=0), out=numbers, casting="unsafe")
-        is_matched[numbers] = True
+        room[begin : begin + len(own)], is_matched[numbers] = numbers, True
         return begin + len(own)
 
     end = max(overlapped(threads, enter, tasks()), default=0)
-    _renumber(room[:end], is_matched, threads)
+    _renumber(room, end, is_matched, threads)
     parts = [np.flatnonzero(part).astype(np.int32) for part in np.split(is_matched, begins[1:-1])]
     taken = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
     keypoints = np.concatenate(parts)
     cameras, pixels, on_plane = _look_up(images, pictures, taken, keypoints, threads)
     return MatchedKeypoints(
-        cameras=cameras, keypoints=keypoints, pixels=pixels, on_plane=on_plane, matches=room[:end]
+        cameras=cameras,
+        keypoints=keypoints,
+        pixels=pixels,
+        on_plane=on_plane,
+        matches=room[:end] if isinstance(room, np.ndarray) else room,
     )
 
 
-def _renumber(keypoints: npt.NDArray[np.integer], chosen: BoolArray, threads: int) -> None:
+def _renumber(keypoints: AnyRows, count: int, chosen: BoolArray, threads: int) -> None:
     """Replace numbers (m, 2) of chosen keypoints by their rows among these, in place."""
-    row_of = np.cumsum(chosen, dtype=keypoints.dtype)
+    row_of: npt.NDArray[np.integer] = np.cumsum(chosen, dtype=keypoints.dtype)
     row_of -= 1
 
     def replace_some(begin: int, end: int) -> None:
         keypoints[begin:end] = row_of.take(keypoints[begin:end])
 
-    in_slices(threads, len(keypoints), _MATCHES_A_SLICE, replace_some)
+    in_slices(threads, count, _MATCHES_A_SLICE, replace_some)
 
 
 def collect_tracks(
@@ -119,7 +123,7 @@ def links_touching(images: Images, links: Links, chosen: BoolArray) -> Links:
     if isinstance(links, ObservedTracks):
         track_of = links.list_of_rows()
         return links.subset(distinct(track_of[own]))
-    joined = connected_components(len(own), links.matches.astype(np.int64))
+    joined = connected_components(len(own), links.matches[:].astype(np.int64))
     touched = np.zeros(len(own), dtype=np.bool_)
     touched[joined[own]] = True
     return links.among(touched[joined])
@@ -174,7 +178,8 @@ def _look_up(
             if not lens.is_adjustable:
                 pixels = lens.focal_px * on_plane[own]
             cameras[own] += view
-        seen[own] = pixels
+        with np.errstate(over="ignore"):  # then 32 bits do not do
+            seen[own] = pixels
         return np.array_equal(seen[own], pixels, equal_nan=True)
 
     runs = lens_runs(images.lens_of, np.diff(ends))

@@ -28,7 +28,7 @@ from sfm_shapefit.base.executors import Advance, nobody
 from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points, concatenate_points, number_points
-from sfm_shapefit.tracks.links import ObservedTracks
+from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.structure_options import StructureOptions
 from sfm_shapefit.tracks.triangulation import (
     PointLimits,
@@ -59,23 +59,37 @@ def triangulate(
         advance: called with the tracks of the first joining that are done, and their number.
         threads: number of threads to share the work among; the answer does not depend on it.
     """
-    views = views_of(images)
     limits = PointLimits(
         max_error_px=options.max_reprojection_error_px,
         min_angle_deg=options.min_triangulation_angle_deg,
         min_length=options.min_track_length,
     )
-    poses, parts = views.poses(images), list[Points]()
     if isinstance(links, ObservedTracks):
-        done = 0
-        for block in map(links.subset, _blocks(np.flatnonzero(links.lengths() >= limits.min_length))):
-            parts.append(views.seen_points(block, triangulate_tracks(block, poses, limits, threads)))
-            done += block.num_tracks
-            advance(done, links.num_tracks)
-        return concatenate_points(parts)
-    matched, joining_limits = links, tuple(joining_limits_px(limits.max_error_px, limits.max_error_px))
-    partners = matched.count_partners()
+        return concatenate_points(_points_of_tracks(images, links, limits, advance, threads))
     fewest = options.fewest_views(images.num_images)
+    return number_points(_points_of_matches(images, links, (limits, fewest), advance, threads))
+
+
+def _points_of_tracks(
+    images: Images, links: ObservedTracks, limits: PointLimits, advance: Advance, threads: int
+) -> Iterator[Points]:
+    views, done = views_of(images), 0
+    poses = views.poses(images)
+    for block in map(links.subset, _blocks(np.flatnonzero(links.lengths() >= limits.min_length))):
+        yield views.seen_points(block, triangulate_tracks(block, poses, limits, threads))
+        done += block.num_tracks
+        advance(done, links.num_tracks)
+
+
+def _points_of_matches(
+    images: Images, matched: MatchedKeypoints, least: tuple[PointLimits, int], advance: Advance, threads: int
+) -> Iterator[Points]:
+    views, (limits, fewest) = views_of(images), least
+    poses, joining_limits = (
+        views.poses(images),
+        (*joining_limits_px(limits.max_error_px, limits.max_error_px),),
+    )
+    partners = matched.count_partners()
     is_left = np.ones(len(partners), dtype=np.bool_)
     for limit_px in joining_limits:
         matched, partners = matched.among(is_left, threads), partners[is_left]
@@ -90,13 +104,12 @@ def triangulate(
         for own in map(joined.subset, _blocks(chosen)):
             tracks = matched.observed(own, threads)
             found = triangulate_tracks(tracks, poses, limits, threads)
-            parts.append(views.seen_points(tracks, found))
+            yield views.seen_points(tracks, found)
             is_left[own.rows[found.points_seen >= 0]] = False
             done += tracks.num_tracks
             if limit_px == joining_limits[0]:  # nearly all tracks
                 advance(done, len(chosen))
         del joined, sizes, chosen  # before the keypoints that are left are copied
-    return number_points(parts)
 
 
 def _blocks(chosen: IntArray) -> Iterator[IntArray]:

@@ -21,8 +21,10 @@ from sfm_shapefit.base.lists import offsets_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points
-from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
+from sfm_shapefit.tracks.links import CameraPoses, SeenTracks
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
+
+_AT_ONCE = 1_000_000  # observations whose pixels are looked up together; they take 24 MB
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -51,14 +53,17 @@ class Views:
         images: Images,
         sensors: BoolArray,
         given: GivenPoses,
-        tracks: ObservedTracks,
+        tracks: SeenTracks,
         found: TriangulatedPoints,
     ) -> AdjustmentProblem:
         """Return the problem of points found of tracks, at the poses of the images of the views.
 
         Lenses among `sensors` (l,) move in their rigs. Rotations that were given have no part yet.
         """
-        used = found.points_seen >= 0
+        used = np.flatnonzero(found.points_seen >= 0).astype(np.int32)
+        pixels = np.empty((len(used), 2))
+        for first in range(0, len(used), _AT_ONCE):
+            pixels[first : first + _AT_ONCE] = tracks.pixels[used[first : first + _AT_ONCE]]
         rotations, translations = self._as_adjusted(images)._sensors(images)
         frames, lenses = images.frame_of[self.images], images.lens_of[self.images]
         rig = Rig(
@@ -73,7 +78,7 @@ class Views:
             points=found.points,
             cameras_seeing=tracks.cameras[used],
             points_seen=found.points_seen[used],
-            pixels=tracks.pixels[used].astype(np.float64),
+            pixels=pixels,
             lenses=tuple(map(_lens_of_views, images.lenses)),
             lens_of_camera=lenses,
             rig=rig,
@@ -98,7 +103,7 @@ class Views:
         translations[own] = np.einsum("cab,cb->ca", back, solved.rig.translations[cameras])
         return moved.with_sensors(rotations, translations)
 
-    def seen_points(self, tracks: ObservedTracks, found: TriangulatedPoints) -> Points:
+    def seen_points(self, tracks: SeenTracks, found: TriangulatedPoints) -> Points:
         """Return triangulated points and their observations; own tracks keep their ids."""
         used = np.flatnonzero(found.points_seen >= 0)
         used = used[np.argsort(found.points_seen[used], kind="stable")]
@@ -107,7 +112,7 @@ class Views:
             xyz=found.points,
             offsets=offsets_of(lengths),
             images=self.images[tracks.cameras[used]],
-            keypoints=tracks.keypoints[used].astype(np.int64),
+            keypoints=tracks.keypoints[used].astype(np.int32, copy=False),
             ids=1 + np.arange(len(lengths)) if tracks.may_split else tracks.ids[found.tracks],
         )
 

@@ -38,6 +38,13 @@ class Lists:
         """Return which row of its list each row is, from 0 on."""
         return np.arange(self.offsets[-1]) - self.spread(self.offsets[:-1])
 
+    def cuts(self, most: int) -> Iterator[IntArray]:
+        """Yield the offsets of some lists after the other, (q + 1,), about so many rows at a time at most."""
+        number, total = -(-int(self.offsets[-1]) // most) or 1, int(self.offsets[-1])
+        cuts = np.searchsorted(self.offsets, np.arange(1, number) * total // number).tolist()
+        for first, end in pairwise([0, *cuts, len(self.offsets) - 1]):
+            yield self.offsets[first : end + 1]
+
     def slice_of(self, k: int) -> slice:
         """Return the rows of a list."""
         return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
@@ -62,7 +69,7 @@ class RowLists(Lists):
     offsets: IntArray
     """(k + 1,)"""
     rows: IntArray
-    """(m,)"""
+    """(m,) numbers, 32 bits each where there may be very many."""
 
     @classmethod
     def by_label(cls, labels: IndexArray, count: int = 0) -> "RowLists":
@@ -81,6 +88,11 @@ class RowLists(Lists):
     def subset(self, chosen: IntArray) -> "RowLists":
         """Return some of the lists, in that order."""
         return self.of(self.rows_of(chosen))
+
+    def blocks(self, most: int) -> Iterator["RowLists"]:
+        """Yield the lists in turn, as `cuts` has them."""
+        for begins in self.cuts(most):
+            yield RowLists(begins - begins[0], self.rows[begins[0] : begins[-1]])
 
     def of(self, lists: "RowLists") -> "RowLists":
         """Return lists of rows of this one's rows as lists of rows of the other arrays."""

@@ -110,7 +110,8 @@ class PartnerCounts:
         self._free = np.ones_like(self._posed) if fixed is None else ~fixed
         self._sizes = np.where(self._posed, num_keypoints, 0)
         self._begins = offsets_of(self._sizes)
-        self._counts = np.zeros((self._begins[-1], 2), dtype=np.int32)
+        # A keypoint is counted once with each image.
+        self._counts = np.zeros((self._begins[-1], 2), dtype=np.min_scalar_type(max(len(self._sizes), 256)))
 
     def anew(self, images: Images) -> "PartnerCounts":
         """Return counts of nothing yet for images others of which are posed."""
@@ -126,14 +127,16 @@ class PartnerCounts:
             matched.on_plane, matched.cameras, poses.rotations, poses.centers, poses.focal_lengths_px,
             poses.images, self._posed, self._free, self._max_error_px,
         )  # fmt: skip
-        first_ones = range(0, len(matched.matches), _MATCHES_A_SLICE)
-        slices = [matched.matches[first : first + _MATCHES_A_SLICE] for first in first_ones]
-        found = in_threads(threads, lambda matches: _find_misses(matches, *given), slices)
-        for matches, kinds in zip(slices, found, strict=True):
-            _count_misses(
-                matches, kinds, matched.cameras, matched.keypoints, poses.images, self._begins, last,
-                self._counts,
-            )  # fmt: skip
+        for some in matched.slices():
+            slices = [
+                some[first : first + _MATCHES_A_SLICE] for first in range(0, len(some), _MATCHES_A_SLICE)
+            ]
+            found = in_threads(threads, lambda matches: _find_misses(matches, *given), slices)
+            for matches, kinds in zip(slices, found, strict=True):
+                _count_misses(
+                    matches, kinds, matched.cameras, matched.keypoints, poses.images, self._begins, last,
+                    self._counts,
+                )  # fmt: skip
 
     def compare(self, points: Points) -> ObservationCounts:
         """Return how many observations of each image agree with the cameras, and how many contradict them.
@@ -144,7 +147,7 @@ class PartnerCounts:
         partners, misses = self._counts.T
         checked, sees = partners >= CHECKED_BY, np.zeros(len(partners), dtype=np.bool_)
         sees[self._begins[points.images] + points.keypoints] = True
-        parts = (checked, checked & sees, checked & ~sees & (2 * misses > partners))
+        parts = (checked, checked & sees, checked & ~sees & (misses > partners - misses))
         image_of = np.repeat(np.arange(len(self._sizes)), self._sizes)
         columns = (np.bincount(image_of[part], minlength=len(self._sizes)).astype(np.int64) for part in parts)
         return ObservationCounts(**dict(zip(("checked", "agreeing", "contradicting"), columns, strict=True)))

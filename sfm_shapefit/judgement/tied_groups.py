@@ -51,7 +51,7 @@ def tie_images(
         return images.names_of(np.flatnonzero(inside[frames] & images.is_posed))
 
     fitting = keypoint_errors_px(structure, threads=threads) <= FITTING_PX
-    rays = Rays(points.points_seen(), frames[points.images], fitting).of_three()
+    rays = Rays(points.points_seen(), frames.astype(np.int32)[points.images], fitting).of_three()
     pairs = links_of_pairs(*(frames[side] for side in fits.sides))
     known = [] if fixed is None else [frames[rigid_strip(images, fixed)]]
     if tied_pairs is not None:
@@ -86,7 +86,7 @@ def lost_points(view: View, structure: Structure, fits: BoolArray, group: IntArr
     if not (across.any() and structure.has_keypoints_of(view)):
         return lost
     begins = offsets_of(view.num_keypoints)
-    point_of, fitting = np.full(begins[-1], -1), np.zeros(begins[-1], dtype=np.bool_)
+    point_of, fitting = np.full(begins[-1], -1, dtype=np.int32), np.zeros(begins[-1], dtype=np.bool_)
     seen = begins[points.images] + points.keypoints
     point_of[seen], fitting[seen] = points.points_seen(), fits
     for batch in view.links(chosen=across):

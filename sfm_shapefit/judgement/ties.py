@@ -30,6 +30,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import (
     BoolArray,
+    Int32Array,
     IntArray,
     distinct,
     distinct_pairs,
@@ -106,20 +107,25 @@ class NodeLinks(NamedTuple):
 class Rays(NamedTuple):
     """Which nodes see which points."""
 
-    points: IntArray
+    points: IntArray | Int32Array
     """(r,) ascending."""
-    nodes: IntArray
+    nodes: IntArray | Int32Array
     """(r,)"""
     fits: BoolArray
     """(r,) whether the observation fits."""
 
+    def starts(self) -> IntArray:
+        """Return the first ray of each point."""
+        return np.flatnonzero(np.append(True, self.points[1:] != self.points[:-1])[: len(self.points)])
+
     def links(self) -> NodeLinks:
         """Return a link for each two rays of a point."""
-        ids, ends, fits = [self.points[:0]], [np.zeros((0, 2), dtype=np.int64)], [self.fits[:0]]
-        for step in range(1, int(np.bincount(self.points).max(initial=1))):
+        ids = [np.zeros(0, dtype=np.int64)]
+        ends, fits = [np.zeros((0, 2), dtype=np.int64)], [self.fits[:0]]
+        for step in range(1, int(np.diff(self.starts(), append=len(self.points)).max(initial=1))):
             there = np.flatnonzero(self.points[step:] == self.points[:-step])
-            ids.append(self.points[there])
-            ends.append(np.column_stack([self.nodes[there], self.nodes[there + step]]))
+            ids.append(self.points[there].astype(np.int64))
+            ends.append(np.column_stack([self.nodes[there], self.nodes[there + step]]).astype(np.int64))
             fits.append(self.fits[there] & self.fits[there + step])
         return NodeLinks(np.concatenate(ids), np.concatenate(ends), np.concatenate(fits))
 
@@ -133,8 +139,10 @@ class Rays(NamedTuple):
 
     def of_three(self) -> "Rays":
         """Return the rays of points that three nodes see; none of a point fits unless three do."""
-        rays = rows_taken(self, (np.bincount(self.points) > 2)[self.points])
-        return rays._replace(fits=rays.fits & (np.bincount(rays.points, rays.fits) > 2)[rays.points])
+        lengths = np.diff(self.starts(), append=len(self.points))
+        rays, lengths = rows_taken(self, np.repeat(lengths > 2, lengths)), lengths[lengths > 2]
+        fitting = np.add.reduceat(rays.fits, rays.starts(), dtype=np.int64)
+        return rays._replace(fits=rays.fits & np.repeat(fitting > 2, lengths))
 
 
 def links_of_pairs(agreeing: IntArray, contradicting: IntArray) -> NodeLinks:
@@ -151,10 +159,10 @@ def find_groups(
     What is unchecked is one group with the largest all the same. `group` (n,) is as of `rigid_groups`, rays
     are those of three.
     """
-    lowest = np.full(int(rays.points.max(initial=-1)) + 1, len(group))
-    np.minimum.at(lowest, rays.points, group[rays.nodes])
-    others = np.bincount(rays.points, group[rays.nodes] != lowest[rays.points])
-    points, is_done = rows_taken(rays, (others > 0)[rays.points]).links(), False
+    groups, starts = group.astype(np.int32)[rays.nodes], rays.starts()
+    several = np.minimum.reduceat(groups, starts) != np.maximum.reduceat(groups, starts)
+    crossing = np.repeat(several, np.diff(starts, append=len(groups)))
+    points, is_done = rows_taken(rays, crossing).links(), False
     while not is_done:
         united = _unite(_unite(group, points, _BY_POINTS), pairs, _BY_PAIRS)
         is_done, group = len(distinct(united)) == len(distinct(group)), united

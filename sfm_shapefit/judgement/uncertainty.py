@@ -142,6 +142,9 @@ def propagate(
     """
     n, d = locations.shape
     terms = inform(locations, edges, information)
+    del information  # which is large, as the factor will be
+    if errors is None:
+        terms = terms._replace(across=terms.across[:0].copy())
     plan = analyze(n, edges)
     if plan.num_bytes(d) > resources.memory_bytes:
         return None

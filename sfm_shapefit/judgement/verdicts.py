@@ -161,6 +161,7 @@ def find_hold(
     # Exact directions are propagated as if they had some noise, and scaled back.
     scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
+    del own, bases  # before the factor, the most memory of a large run
     errors = None if measured.evidence is None else measured.evidence.errors
     sampled = None if errors is None else _Sampled(errors, excess, scale)
     open_nodes = np.empty(0, np.int64) if undetermined_nodes is None else undetermined_nodes

@@ -74,7 +74,8 @@ def points_of_pictures(source: MatchSource, fits: PairFits) -> Structure:
     images, view = source.images, source.view
     pictures = ModelKeypoints(images, view.keypoints, view.num_keypoints)
     links = view.links(chosen=~is_among(view.pairs, fits.sides[1]))
-    matches = collect_matches(images, pictures, np.arange(images.num_images), links, view.num_matches)
+    room = np.empty((view.num_matches, 2), dtype=np.uint32)
+    matches = collect_matches(images, pictures, np.arange(images.num_images), links, room)
     options = StructureOptions()
     points = triangulate(images, matches, options)
     structure = Structure(points, images, pictures)

@@ -135,11 +135,14 @@ def open_client(scheduler: str) -> "Iterator[Client | None]":
         yield None
         return
     try:
+        import dask
         from distributed import Client
     except ModuleNotFoundError:
         raise MissingExtraError("--scheduler", "dask.distributed", "dask") from None
     try:
-        client = Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
+        # Else the client keeps the last thousand messages of up to a megabyte.
+        with dask.config.set({"distributed.admin.low-level-log-length": 0}):
+            client = Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise WorkerError(f"the dask scheduler {scheduler} cannot be reached; check its address") from error
     with client:

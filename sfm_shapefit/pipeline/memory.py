@@ -47,12 +47,12 @@ _BLOCK = 9  # entries of a block of the factor; three coordinates by three
 _OBSERVATIONS_OF_A_MATCH = 0.7  # observations for a match, if keypoints are more; .45 to .66 measured
 _OBSERVATION_BYTES = 420.0  # bytes of an observation; its track, and its part of the normal equations
 _DIVIDED_BYTES = 270.0  # the same where adjustments are divided: a part has normal equations at a time
-_CHOSEN_BYTES, _KEPT_BYTES, _ENTRY_BYTES = 30.0, 75.0, 150.0
-"""Bytes of an observation of few tracks: while these are chosen; laid out; and of its equations beside."""
+_KEPT_BYTES, _ENTRY_BYTES = 75.0, 150.0
+"""Bytes of an observation of few tracks, laid out; and of its equations beside."""
 _OVERSHOT = 1.2  # observations of few tracks for each that an image wants; 1.13 measured
 _THIN_PAIRS, _THIN_FACTOR = 1.9, 1.9
 """Pairs of cameras that meet in few tracks, for each of the graph; blocks of their factor, likewise."""
-_ITERATIVE_BYTES = 70e3  # bytes of a camera; the factors of its blocks and of the coarse system
+_ITERATIVE_BYTES = 40e3  # bytes of a camera; the factors of its blocks and of the coarse system
 _AVERAGED_BLOCKS, _AVERAGED_FACTORS = 10.0, 1.2
 """Blocks that averaging holds for each pair; for each block of the factor too, with its update matrices."""
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000  # unknowns of an adjusted camera; up to as many, their system is dense
@@ -182,14 +182,13 @@ def _peaks(work: Workload, plan: MemoryPlan) -> dict[str, float]:
     is_kept = plan.reading.keeps and work.num_matches <= KEPT_MATCHES
     kept = 80.0 * work.num_matches if is_kept else 0.0
     peaks["placing"] = throughout + kept + solving + samples + moved + factor + 0.5 * batch
-    tracks = 44.0 * work.num_keypoints + MATCH_BYTES * work.num_matches + 0.5 * batch  # and the seed
-    if work.num_matches > MOST_BESIDE_TRACKS:
-        tracks -= in_memory
+    tracks = 44.0 * work.num_keypoints + 0.5 * batch  # and the seed; very many matches stand in a file
+    are_many = work.num_matches > MOST_BESIDE_TRACKS
+    tracks += -in_memory if are_many else MATCH_BYTES * work.num_matches
     seeded = throughout + kept + 300.0 * work.num_edges + tracks
     if work.averages:
         observations, solving = _adjusted_thinly(work, plan)
-        given_up = in_memory if work.num_matches > MOST_BESIDE_TRACKS else 0.0
-        peaks["triangulating a first placement"] = seeded - rays + _CHOSEN_BYTES * observations
+        given_up = in_memory if are_many else 0.0
         solving += throughout - rays - given_up
         peaks["adjusting a first placement"] = solving + _KEPT_BYTES * observations
     if work.adjusts_bundle or (work.adjusts and plan.adjustment):
@@ -213,7 +212,7 @@ def _adjusted_thinly(work: Workload, plan: MemoryPlan) -> tuple[float, float]:
     if plan.divides or work.num_images > MOST_WHOLE:
         return observations, system + _ITERATIVE_BYTES * work.num_images
     # The factor has numbers of 32 bits; up to so many frames one of 64 follows, with its selected inverse.
-    copies = 2.2 if work.num_images <= MOST_FRAMES else 0.5
+    copies = 2.0 if work.num_images <= MOST_FRAMES else 0.5
     solving = system + copies * block * _THIN_FACTOR * work.factor_entries
     return observations, max(entries, solving) if observations > MANY_ENTRIES else entries + solving
 

@@ -7,6 +7,7 @@ short to tell the scale, the sensors are taken to share one center.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ import numpy as np
 from sfm_shapefit.adjustment.free_sensors import OpenSensorError
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.limits import OUTNUMBERED
@@ -150,11 +152,12 @@ def _run_with_other_offsets(
     is_moved = (offsets != images.sensors.translations).any() and not inputs.fixed.any()
     for rigs in ways if is_moved else ():
         start = with_offsets(_with_rigs(inputs, rigs), source, offsets)
-        result = _run_in_scale(*start, clock)
-        if isinstance(result, LocateResult) and result.kept.sum() >= least:
-            doubt = f"{wrong[0]}, so sensors are placed by these matches, as far away as the rig has them"
-            suspicions = (*result.suspicions, of_model(Kind.INPUT, doubt))
-            return *start, replace(result, suspicions=suspicions), ()
+        with suppress(InputError, UnsolvableError):  # the first result, or error, stays
+            result = _run_in_scale(*start, clock)
+            if isinstance(result, LocateResult) and result.kept.sum() >= least:
+                doubt = f"{wrong[0]}, so sensors are placed by these matches, as far away as the rig has them"
+                suspicions = (*result.suspicions, of_model(Kind.INPUT, doubt))
+                return *start, replace(result, suspicions=suspicions), ()
     if isinstance(why, LocateResult):
         return inputs, source, why, ()
     if isinstance(why, OpenSensorError):

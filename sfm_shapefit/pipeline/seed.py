@@ -89,6 +89,7 @@ def _make_points(state: ModelState, clock: Clock) -> tuple[Images, Points, Estim
         counts = PartnerCounts(images, view.num_keypoints, limit_px, state.source.fixed)
         partners = _count(links, images, counts, clock.threads)
         del links
+        hand_back_memory()
         points = filter_points(
             Structure(points, posed, state.pictures(images, rows)), options.structure, clock.threads
         )

@@ -12,6 +12,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.executors import Advance, Crew
 from sfm_shapefit.base.geometry import Similarity
+from sfm_shapefit.base.row_file import make_room
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.scale_bars import MeasuredBars
@@ -31,7 +32,7 @@ from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
-from sfm_shapefit.scene.matches import is_among
+from sfm_shapefit.scene.matches import MOST_BESIDE_TRACKS, is_among
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.solver.solve import refuse_admm
 
@@ -215,4 +216,6 @@ class ModelState:
         links = view.links(chosen=wanted, advance=advance, consume=True)
         place = np.full(images.num_images, -1)
         place[rows] = np.arange(len(rows))
-        return collect_matches(posed, pictures, place, links, view.num_matches, threads)
+        number = np.uint32 if view.num_keypoints.sum() < 2**32 else np.int64
+        room = make_room((view.num_matches, 2), number, in_file=view.num_matches > MOST_BESIDE_TRACKS)
+        return collect_matches(posed, pictures, place, links, room, threads)

@@ -86,16 +86,14 @@ def fit_mixture(measured: MeasuredGraph, locations: FloatArray, threads: int = 1
     """Fit share and level of the right pairs of each class to the residuals at locations (n, d)."""
     graph, classes, own = measured.graph, measured.classes, own_variances(measured)
     angles, d, count = residual_angles(graph, locations), graph.dimension, int(classes.max()) + 1
-    peak, given = np.exp(log_ratio(0.0, 1.0, d)), (classes, angles, own)
+    peak, given = log_ratio(0.0, 1.0, d), (classes, angles, own)
     numbers = np.maximum(np.bincount(classes, minlength=count), 1)
     shares = np.full(count, 0.5)
     levels2 = np.array([np.median(angles[classes == k]) ** 2 if k in classes else 1.0 for k in range(count)])
     for _ in range(_EM_ROUNDS):
         before, levels2 = (shares, levels2), np.clip(levels2, *_LEVELS2)
         sums = np.zeros((len(angles) // SLICE + 1, 3, count))
-        in_slices(
-            threads, len(angles), SLICE, _add_right, given, (levels2, peak * shares / (1.0 - shares)), d, sums
-        )
+        in_slices(threads, len(angles), SLICE, _add_right, given, (levels2, peak + logit(shares)), d, sums)
         right, wanted, inverse = sums.sum(axis=0)
         shares = np.clip(right / numbers, *_SHARES)
         # Stationary where sum right (A^2 / (d - 1) - total) / total^2 = 0; without variances their mean.
@@ -124,10 +122,8 @@ def _add_right(begin: int, end: int, given: Any, model: Any, dimension: int, sum
     for e in range(begin, end):
         k = classes[e]
         total = levels2[k] + own[e]
-        ratio = odds[k] * np.exp(-0.5 * angles[e] ** 2 / total)
-        for _ in range(dimension - 1):
-            ratio /= np.sqrt(total)
-        right = 1.0 / (1.0 + 1.0 / ratio)
+        log_odds = odds[k] - 0.5 * (angles[e] ** 2 / total + (dimension - 1) * np.log(total))
+        right = 1.0 / (1.0 + np.exp(-log_odds))
         there[0, k] += right
         there[1, k] += right * (angles[e] / total) ** 2
         there[2, k] += right / total

@@ -26,6 +26,7 @@ _TAUS = (0.2, 2.0)  # standard deviation of log lengths, least and largest; othe
 _SPREAD = 1.25  # standard deviations per mean absolute deviation; that of a normal variable
 _SIZES = np.array([1, 2, 4, 8, 16, 32, 64])
 """Averages with the neighbors; 64 more say little more, and cost as much."""
+_LEAST = 1e-24  # share of the first mean square; averages of a dense graph soon cancel to their rounding
 _PROBES = 8  # vectors of signs; their mean square is known to a few percent then
 
 
@@ -37,7 +38,8 @@ class LengthPrior:
         m, around = graph.num_edges, adjacency(graph.num_nodes, graph.edges)
         self._graph, self._around = graph, (around.pointers, around.neighbors, around.edge_of)
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (m, _PROBES))
-        self._independent = np.mean(self._averages(signs - signs.mean(axis=0)), axis=1) * m / graph.num_nodes
+        squares = np.mean(self._averages(signs - signs.mean(axis=0)), axis=1) * m / graph.num_nodes
+        self._independent = np.maximum(squares, _LEAST * squares[0])
 
     def variance(self, logs: FloatArray) -> float:
         """Return that of one of m log lengths."""

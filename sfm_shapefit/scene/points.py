@@ -1,11 +1,18 @@
 """The 3D points of a model, and the keypoints of images that observe them, as arrays."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, stable_order
+from sfm_shapefit.base.arrays import (
+    BoolArray,
+    FloatArray,
+    Int32Array,
+    IntArray,
+    stable_order,
+)
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
 from sfm_shapefit.scene.matches import KeypointMatches
@@ -19,37 +26,46 @@ class Points(Lists):
     """(x, 3)"""
     offsets: IntArray
     """(x + 1,)"""
-    images: IntArray
-    """(o,) image of each observation."""
-    keypoints: IntArray
+    images: IntArray | Int32Array
+    """(o,) image of each observation; of 32 bits, as the next ones."""
+    keypoints: IntArray | Int32Array
     """(o,) which of the image's keypoints it is."""
     ids: IntArray
     """(x,)"""
     errors_px: FloatArray | None = None
     """(x,) mean reprojection errors; None if unknown."""
 
+    def __post_init__(self) -> None:
+        """Bring the columns of observations to their type."""
+        for name in ("images", "keypoints"):
+            object.__setattr__(self, name, getattr(self, name).astype(np.int32, copy=False))
+
     @property
     def num_points(self) -> int:
         """Number of points, x."""
         return len(self.xyz)
 
-    points_seen = Lists.list_of_rows  # the point of each observation, (o,)
+    def points_seen(self) -> Int32Array:
+        """Return the point of each observation, (o,)."""
+        return self.spread(np.arange(self.num_points, dtype=np.int32))
 
     def count_seen(self, num_images: int) -> IntArray:
         """Return how many observations each image has, (i,)."""
         return np.bincount(self.images, minlength=num_images).astype(np.int64)
 
-    def rows_of_images(self, num_images: int) -> list[IntArray]:
+    def rows_of_images(self, num_images: int) -> RowLists:
         """Return the observations of each image, ascending."""
-        return list(RowLists.by_label(self.images, num_images))
+        rows_of = RowLists.by_label(self.images, num_images)
+        rows: Any = rows_of.rows.astype(np.int32)
+        return RowLists(rows_of.offsets, rows)
 
     def paired(self, chosen: BoolArray) -> BoolArray:
         """Return which observations (o,) are chosen with another one of their point."""
-        return chosen & (self._count(chosen) >= 2)[self.points_seen()]
+        return chosen & (self.count(chosen) >= 2)[self.points_seen()]
 
     def taken(self, chosen: BoolArray) -> "Points":
         """Return the points with some of their observations (o,); those that keep none are gone."""
-        lengths = self._count(chosen)
+        lengths = self.count(chosen)
         kept = lengths > 0
         return Points(
             xyz=self.xyz[kept],
@@ -95,32 +111,35 @@ class Points(Lists):
         return replace(
             self,
             offsets=offsets_of(np.bincount(points, minlength=self.num_points)),
-            images=np.append(self.images, new[:, 1])[order],
-            keypoints=np.append(self.keypoints, new[:, 2])[order],
+            images=np.append(self.images, new[:, 1])[order].astype(np.int32),
+            keypoints=np.append(self.keypoints, new[:, 2])[order].astype(np.int32),
         )
 
     def transformed(self, motion: Similarity) -> "Points":
         """Return the points after a similarity of the world."""
         return replace(self, xyz=motion.apply(self.xyz))
 
-    def _count(self, chosen: BoolArray) -> IntArray:
-        """Return how many observations of each point are chosen, (x,)."""
-        return np.diff(offsets_of(chosen)[self.offsets])
+    def count(self, chosen: BoolArray) -> IntArray:
+        """Return how many observations (o,) of each point are chosen, (x,)."""
+        before = np.zeros(len(chosen) + 1, dtype=np.int32)
+        np.cumsum(chosen, out=before[1:])
+        return np.diff(before[self.offsets]).astype(np.int64)
 
 
-def number_points(parts: Sequence[Points]) -> Points:
+def number_points(parts: Iterable[Points]) -> Points:
     """Return the points of all parts one after the other, with ids from 1 on."""
     points = concatenate_points(parts)
     return replace(points, ids=np.arange(1, points.num_points + 1))
 
 
-def concatenate_points(parts: Sequence[Points]) -> Points:
+def concatenate_points(parts: Iterable[Points]) -> Points:
     """Return the points of all parts one after the other, with the ids that they have."""
-    lengths = np.concatenate([np.zeros(0, dtype=np.int64), *(part.lengths() for part in parts)])
-    return Points(
-        xyz=np.concatenate([np.zeros((0, 3)), *(part.xyz for part in parts)]),
-        offsets=offsets_of(lengths),
-        images=np.concatenate([np.zeros(0, dtype=np.int64), *(part.images for part in parts)]),
-        keypoints=np.concatenate([np.zeros(0, dtype=np.int64), *(part.keypoints for part in parts)]),
-        ids=np.concatenate([np.zeros(0, dtype=np.int64), *(part.ids for part in parts)]),
-    )
+    nothing = np.zeros(0, dtype=np.int32)
+    columns: list[list[Any]] = [[np.zeros((0, 3))], [nothing], [nothing], [nothing], [nothing]]
+    for part in parts:
+        own = part.xyz, part.lengths(), part.images, part.keypoints, part.ids
+        for column, rows in zip(columns, own, strict=True):
+            column.append(rows)
+    # A column at a time, for all of them twice would take the most memory of a run.
+    xyz, lengths, images, keypoints, ids = (np.concatenate(columns.pop(0)) for _ in range(5))
+    return Points(xyz=xyz, offsets=offsets_of(lengths), images=images, keypoints=keypoints, ids=ids)

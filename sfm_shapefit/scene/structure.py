@@ -4,9 +4,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.lists import RowLists
+from sfm_shapefit.base.row_file import Widened
 from sfm_shapefit.scene.images import Images, KeypointRays
 from sfm_shapefit.scene.matches import View
 from sfm_shapefit.scene.points import Points
@@ -28,16 +30,21 @@ class Structure:
     @cached_property
     def rows_of_images(self) -> RowLists:
         """The observations of each image, ascending."""
-        return RowLists.by_label(self.points.images, self.images.num_images)
+        return self.points.rows_of_images(self.images.num_images)
 
     @cached_property
-    def pixels(self) -> FloatArray:
+    def pixels(self) -> Widened:
         """Where the observations are, (o, 2); read once for all that ask."""
-        pixels = np.empty((len(self.points.images), 2))
+        stored: npt.NDArray[np.floating] = np.zeros((len(self.points.images), 2), dtype=np.float32)
         for image, rows in enumerate(self.rows_of_images):
             if len(rows):
-                pixels[rows] = self.pictures.pixels(image, self.points.keypoints[rows])
-        return pixels
+                pixels = self.pictures.pixels(image, self.points.keypoints[rows])
+                with np.errstate(over="ignore"):
+                    stored[rows] = pixels
+                if not np.array_equal(stored[rows], pixels, equal_nan=True):  # 32 bits do not do
+                    stored = stored.astype(np.float64)
+                    stored[rows] = pixels
+        return Widened(stored)
 
     def has_keypoints_of(self, view: View) -> bool:
         """Return whether there are points, of the keypoints that the matches have."""

@@ -23,12 +23,15 @@ def filter_points(structure: Structure, options: StructureOptions, threads: int 
     points = structure.points
     errors_px = keypoint_errors_px(structure, threads=threads)
     fitting = points.paired(errors_px <= options.max_reprojection_error_px)  # false for NaN
-    kept = points.taken(fitting)
-    sums = np.bincount(kept.points_seen(), errors_px[fitting], kept.num_points)
-    kept = replace(kept, errors_px=sums / kept.lengths())
-    is_kept = _are_wide(kept, structure.images.centers, options.min_triangulation_angle_deg, threads)
-    is_kept &= kept.lengths() >= options.min_track_length
-    return kept.taken(is_kept[kept.points_seen()])
+    errors_px[~fitting] = 0.0
+    sums = np.bincount(points.points_seen(), errors_px, points.num_points)
+    del errors_px
+    lengths = points.count(fitting)
+    rays = fitting, lengths, structure.images.centers
+    is_kept = _are_wide(points, rays, options.min_triangulation_angle_deg, threads)
+    is_kept &= lengths >= max(options.min_track_length, 1)
+    points = replace(points, errors_px=sums / np.maximum(lengths, 1))
+    return points.taken(fitting & is_kept[points.points_seen()])
 
 
 def keypoint_errors_px(structure: Structure, *, ahead: bool = True, threads: int = 1) -> FloatArray:
@@ -64,31 +67,38 @@ def keypoint_offsets_px(
             with np.errstate(invalid="ignore"):  # a point that is not finite
                 in_camera[own] = (in_camera[own] - centers[image]) @ rotations[image].T
         found = structure.pictures.project(int(some[0]), in_camera, ahead=ahead)
-        return observed.rows, lens.offsets_px(found, pixels.take(observed.rows, axis=0))
+        return observed.rows, lens.offsets_px(found, pixels[observed.rows])
 
     runs = lens_runs(images.lens_of[chosen], rows_of.lengths()[chosen])
     return in_threads(threads, project, (chosen[begin:end] for begin, end in runs))
 
 
-def _are_wide(points: Points, centers: FloatArray, least_deg: float, threads: int) -> BoolArray:
-    """Return which points two of their observations see under an angle, or its supplement, of so much."""
+def _are_wide(
+    points: Points, seen: tuple[BoolArray, IntArray, FloatArray], least_deg: float, threads: int
+) -> BoolArray:
+    """Return which points two observations see under an angle, or its supplement, of so much.
+
+    Seen are chosen observations (o,), so many of each point (x,), from the centers (i, 3) of the images.
+    """
     wide, cosine = np.zeros(points.num_points, dtype=np.bool_), np.cos(np.radians(least_deg))
+    chosen, counts, centers = seen
 
     def look(ends: tuple[int, int]) -> None:
         begin, end = ends
-        offsets = points.offsets[begin : end + 1]
-        lengths, images = np.diff(offsets), points.images[offsets[0] : offsets[-1]]
+        own_rows = slice(points.offsets[begin], points.offsets[end])
+        lengths, images = counts[begin:end], points.images[own_rows][chosen[own_rows]]
+        offsets = offsets_of(lengths)
         rays = centers.take(images, axis=0) - np.repeat(points.xyz[begin:end], lengths, axis=0)
         with np.errstate(invalid="ignore"):
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         for first in range(int(lengths.max(initial=1)) - 1):
             left = np.flatnonzero(~wide[begin:end] & (lengths > first + 1))  # a few, after the first round
-            own, counts = offsets[left] - offsets[0] + first, lengths[left] - first - 1
-            others = np.repeat(own + 1 - offsets_of(counts)[:-1], counts)
+            own, others_of = offsets[left] + first, lengths[left] - first - 1
+            others = np.repeat(own + 1 - offsets_of(others_of)[:-1], others_of)
             ahead = rays.take(others + np.arange(len(others)), axis=0)
-            cosines = np.abs(np.einsum("pa,pa->p", np.repeat(rays[own], counts, axis=0), ahead))
-            wide[begin + np.repeat(left, counts)[cosines <= cosine]] = True
+            cosines = np.abs(np.einsum("pa,pa->p", np.repeat(rays[own], others_of, axis=0), ahead))
+            wide[begin + np.repeat(left, others_of)[cosines <= cosine]] = True
 
-    for _ in in_threads(threads, look, batch_ranges(points.lengths(), 100_000)):  # so that few rays are held
+    for _ in in_threads(threads, look, batch_ranges(counts, 100_000)):  # so that few rays are held
         pass
     return wide

@@ -1,5 +1,6 @@
 """Tracks: which keypoints of which cameras are taken for the same point, before any point is known."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,14 +13,14 @@ from sfm_shapefit.base.arrays import (
     IndexArray,
     Int32Array,
     IntArray,
-    stable_order,
 )
 from sfm_shapefit.base.executors import gathered, in_ranges, in_threads, overlapped
 from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.base.lists import Lists, RowLists, offsets_of
+from sfm_shapefit.base.lists import Lists, RowLists
+from sfm_shapefit.base.row_file import AnyRows, Gathered
 from sfm_shapefit.scene.epipolar import sampson_px, write_ray
-from sfm_shapefit.tracks.joining import number_trees
+from sfm_shapefit.tracks.joining import list_trees
 
 _MATCHES_A_SLICE = 4_000_000  # matches that are counted at once; for each slice all keypoints are counted
 _MATCHES_AT_ONCE = 500_000  # matches that are looked at together; Python can be interrupted in between
@@ -99,15 +100,19 @@ class MatchedKeypoints:
     """(K, 2) as the adjustment's lens takes them; of 32 bits where these hold them."""
     on_plane: FloatArray
     """(K, 2) see `ObservedTracks`."""
-    matches: npt.NDArray[np.integer]
+    matches: AnyRows
     """(m, 2) rows of the above, of any type of integer."""
+
+    def slices(self) -> Iterator[IndexArray]:
+        """Yield the matches, some millions at a time."""
+        for first in range(0, len(self.matches), _MATCHES_A_SLICE):
+            yield self.matches[first : first + _MATCHES_A_SLICE]
 
     def count_partners(self) -> Int32Array:
         """Return how many matches each keypoint has, (K,)."""
         counts = np.zeros(len(self.cameras), dtype=np.int32)
-        for first in range(0, len(self.matches), _MATCHES_A_SLICE):
-            ends = self.matches[first : first + _MATCHES_A_SLICE].astype(np.int64)
-            counts += np.bincount(ends.ravel(), minlength=len(counts)).astype(np.int32)
+        for ends in self.slices():
+            counts += np.bincount(ends.astype(np.int64).ravel(), minlength=len(counts)).astype(np.int32)
         return counts
 
     def among(self, chosen: BoolArray, threads: int = 1) -> "MatchedKeypoints":
@@ -128,7 +133,7 @@ class MatchedKeypoints:
             keypoints=self.keypoints[chosen],
             pixels=self.pixels.compress(chosen, axis=0),
             on_plane=self.on_plane.compress(chosen, axis=0),
-            matches=np.concatenate(matches) if matches else self.matches,
+            matches=np.concatenate([np.zeros((0, 2), dtype=self.matches.dtype), *matches]),
         )
 
     def join(self, poses: CameraPoses, limit_px: float, threads: int = 1) -> RowLists:
@@ -153,12 +158,7 @@ class MatchedKeypoints:
         starts = range(0, len(self.matches), _MATCHES_AT_ONCE)
         for matches, agree in overlapped(threads, find_agreeing, starts):
             _merge(matches, agree, parents)
-        track = number_trees(parents, np.arange(len(parents), dtype=np.int32))
-        del parents  # before what orders the keypoints, which is larger
-        rows, lengths = stable_order(track), np.bincount(track)
-        del track
-        rows, lengths = rows[np.repeat(lengths > 1, lengths)], lengths[lengths > 1]
-        return RowLists(offsets_of(lengths), rows)
+        return list_trees(parents)
 
     def observed(self, joined: RowLists, threads: int = 1) -> ObservedTracks:
         """Return tracks that are known by their rows."""
@@ -170,6 +170,45 @@ class MatchedKeypoints:
             on_plane=gathered(threads, self.on_plane, joined.rows),
             ids=np.arange(len(joined.offsets) - 1),
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JoinedKeypoints(RowLists):
+    """Tracks of matched keypoints, each of one point; what is known of an observation is not copied."""
+
+    matched: MatchedKeypoints
+    may_split = True
+
+    @property
+    def ids(self) -> IntArray:
+        """(t,) as of `ObservedTracks`."""
+        return np.arange(len(self.offsets) - 1)
+
+    @property
+    def cameras(self) -> Gathered:
+        """(m,) as of `ObservedTracks`."""
+        return Gathered(self.matched.cameras, self.rows)
+
+    @property
+    def keypoints(self) -> Gathered:
+        """(m,) as of `ObservedTracks`."""
+        return Gathered(self.matched.keypoints, self.rows)
+
+    @property
+    def pixels(self) -> Gathered:
+        """(m, 2) as of `ObservedTracks`."""
+        return Gathered(self.matched.pixels, self.rows)
+
+    def of_points(self, points_seen: IndexArray) -> "JoinedKeypoints":
+        """Return the tracks of points, as `ObservedTracks.of_points` does."""
+        if np.array_equal(points_seen, self.spread(np.arange(len(self.offsets) - 1, dtype=np.int32))):
+            return self
+        joined = self.of(RowLists.by_label(points_seen))
+        return JoinedKeypoints(joined.offsets, joined.rows, self.matched)
+
+
+SeenTracks = ObservedTracks | JoinedKeypoints
+"""Tracks whose observations can be looked up."""
 
 
 @kernel

@@ -18,14 +18,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import IntArray, UInt64Array, quantile
+from sfm_shapefit.base.arrays import IndexArray, IntArray, UInt64Array, quantile
 from sfm_shapefit.base.jit import kernel, mix_bits
+from sfm_shapefit.base.lists import RowLists
+from sfm_shapefit.base.row_file import Gathered
 
 _LONG = 6  # views; longer tracks come no earlier, see the header
 _WANTED, _WANTED_IN_ALL = 200, 20_000  # observations per image, and in all; small scenes can afford more each
 # Observations beyond which a track may be far longer than the others, and how many times as long as nine
 # tenths of them it is then; see the header.
 _MAYBE_JOINED, _FAR_LONGER = 100, 4.0
+_MIXED_AT_ONCE = 1_000_000  # observations whose pixels are put together; they take 60 MB
 _TURN = np.uint64(0x9E3779B97F4A7C15)  # multiplier of the second coordinate; the increment of splitmix64
 
 
@@ -35,7 +38,11 @@ def wanted_observations(num_images: int, times: int = 1) -> int:
 
 
 def choose_thin_tracks(
-    offsets: IntArray, images: IntArray, pixels: npt.NDArray[np.floating], num_images: int, times: int = 1
+    offsets: IntArray,
+    images: IndexArray,
+    pixels: npt.NDArray[np.floating] | Gathered,
+    num_images: int,
+    times: int = 1,
 ) -> IntArray:
     """Return tracks that together hold every image, ascending.
 
@@ -62,12 +69,15 @@ def _longest(lengths: IntArray) -> float:
     return max(_MAYBE_JOINED, _FAR_LONGER * float(quantile(lengths, 0.9)))
 
 
-def _draw(offsets: IntArray, pixels: npt.NDArray[np.floating]) -> UInt64Array:
+def _draw(offsets: IntArray, pixels: npt.NDArray[np.floating] | Gathered) -> UInt64Array:
     """Return a random number of each track, (t,), that its pixels alone determine."""
-    bits = np.ascontiguousarray(pixels, dtype=np.float64).view(np.uint64)
-    mixed = mix_bits(mix_bits(bits[:, 0]) + _TURN * bits[:, 1])
-    sums = np.concatenate([np.zeros(1, dtype=np.uint64), np.cumsum(mixed)])
-    return np.asarray(mix_bits(sums[offsets[1:]] - sums[offsets[:-1]]))
+    drawn = [np.zeros(0, dtype=np.uint64)]
+    for own in RowLists(offsets, np.zeros(0, dtype=np.int64)).cuts(_MIXED_AT_ONCE):
+        bits = np.ascontiguousarray(pixels[own[0] : own[-1]], dtype=np.float64).view(np.uint64)
+        mixed = mix_bits(mix_bits(bits[:, 0]) + _TURN * bits[:, 1])
+        sums = np.append(np.uint64(0), np.cumsum(mixed))[own - own[0]]
+        drawn.append(mix_bits(sums[1:] - sums[:-1]))
+    return np.concatenate(drawn)
 
 
 @kernel

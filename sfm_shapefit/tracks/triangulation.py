@@ -15,7 +15,7 @@ for the middle point.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -27,7 +27,7 @@ from sfm_shapefit.base.executors import in_threads
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.lists import RowLists, offsets_of
 from sfm_shapefit.scene.epipolar import write_ray
-from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.tracks.links import CameraPoses, JoinedKeypoints, MatchedKeypoints, ObservedTracks
 
 # Observations between which Python can be interrupted: about 0.1 s.
 _SLICE = 100_000
@@ -71,6 +71,11 @@ class TriangulatedPoints:
         has_ray = np.isfinite(tracks.on_plane).all(axis=1)
         seen = np.where(has_ray, tracks.list_of_rows(), -1)
         return cls(points=points, tracks=np.arange(tracks.num_tracks), points_seen=seen)
+
+    def count_seen(self, least: int = 1) -> int:
+        """Return how many observations are of points that have at least so many."""
+        lengths = np.bincount(self.points_seen[self.points_seen >= 0])
+        return int(lengths[lengths >= least].sum())
 
     def of_length(self, least: int) -> "TriangulatedPoints":
         """Return the points with at least that many observations; the observations of others are of none."""
@@ -135,7 +140,7 @@ def triangulate_matches(
     limits: PointLimits,
     threshold_px: float,
     threads: int = 1,
-) -> tuple[ObservedTracks, TriangulatedPoints]:
+) -> tuple[JoinedKeypoints, TriangulatedPoints]:
     """Return the points of matches, and a track for each of what it is seen by.
 
     Where a twentieth of the matches is wrong, those within 4 px join half of all observations of a ring of
@@ -151,51 +156,44 @@ def triangulate_matches(
     """
     place = poses, limits, threads
     joined = matched.join(poses, limits.max_error_px, threads)
-    is_chain = joined.lengths() > _CHAIN * _count_images(joined, poses.images[matched.cameras])
     is_left: BoolArray = np.zeros(len(matched.cameras), dtype=np.bool_)
-    is_left[joined.subset(np.flatnonzero(is_chain)).rows] = True
-    parts = [_triangulate_joined(matched, joined.subset(np.flatnonzero(~is_chain)), *place)]
+    parts = list[tuple[FloatArray, RowLists]]()
+    for own in joined.blocks(_JOINED_AT_ONCE):
+        is_chain = own.lengths() > _CHAIN * _count_images(own, poses.images[matched.cameras[own.rows]])
+        is_left[own.subset(np.flatnonzero(is_chain)).rows] = True
+        parts.append(_triangulate_joined(matched, own.subset(np.flatnonzero(~is_chain)), *place))
+    del joined
     left, rows = matched, np.arange(len(is_left))
-    for limit_px in joining_limits_px(threshold_px, limits.max_error_px) if is_chain.any() else ():
+    for limit_px in joining_limits_px(threshold_px, limits.max_error_px) if is_left.any() else ():
         left, rows = left.among(is_left, threads), rows[is_left]
-        points, seen = _triangulate_joined(left, left.join(poses, limit_px, threads), *place)
-        parts.append((points, RowLists(seen.offsets, rows[seen.rows])))
         is_left = np.ones(len(rows), dtype=np.bool_)
-        is_left[seen.rows] = False
-    tracks = _concatenate([seen for _, seen in parts])
-    return matched.observed(tracks, threads), TriangulatedPoints(
+        for own in left.join(poses, limit_px, threads).blocks(_JOINED_AT_ONCE):
+            points, seen = _triangulate_joined(left, own, *place)
+            parts.append((points, RowLists(seen.offsets, rows[seen.rows])))
+            is_left[seen.rows] = False
+    lengths = np.concatenate([seen.lengths() for _, seen in parts])
+    joined_rows = np.concatenate([seen.rows.astype(np.int32, copy=False) for _, seen in parts])
+    return JoinedKeypoints(offsets_of(lengths), joined_rows, matched), TriangulatedPoints(
         points=np.concatenate([points for points, _ in parts]),
-        tracks=np.arange(len(tracks.offsets) - 1),
-        points_seen=tracks.spread(np.arange(len(tracks.offsets) - 1, dtype=np.int32)),
+        tracks=np.arange(len(lengths)),
+        points_seen=np.repeat(np.arange(len(lengths), dtype=np.int32), lengths),
     )
 
 
 def _count_images(joined: RowLists, images: IntArray) -> IntArray:
-    """Return how many images the keypoints of each track are of, whose own images (K,) ascend."""
-    own, is_new = images[joined.rows], np.ones(len(joined.rows), dtype=np.int64)
-    is_new[1:] = own[1:] != own[:-1]
+    """Return how many images the rows (m,) of each track are of, by the image of each row, ascending."""
+    is_new = np.ones(len(images), dtype=np.int64)
+    is_new[1:] = images[1:] != images[:-1]
     is_new[joined.offsets[:-1]] = 1
-    return np.asarray(np.add.reduceat(is_new, joined.offsets[:-1])) if len(own) else np.zeros(0, np.int64)
+    return np.asarray(np.add.reduceat(is_new, joined.offsets[:-1])) if len(images) else np.zeros(0, np.int64)
 
 
 def _triangulate_joined(
     matched: MatchedKeypoints, joined: RowLists, poses: CameraPoses, limits: PointLimits, threads: int
 ) -> tuple[FloatArray, RowLists]:
     """Return the points (k, 3) of joined keypoints, and the rows that see each."""
-    number, total = -(-len(joined.rows) // _JOINED_AT_ONCE) or 1, len(joined.rows)
-    cuts = np.searchsorted(joined.offsets, np.arange(1, number) * total // number).tolist()
-    points, seen = list[FloatArray](), list[RowLists]()
-    for tracks in pairwise([0, *cuts, len(joined.offsets) - 1]):
-        own = joined.subset(np.arange(*tracks))
-        found = triangulate_tracks(matched.observed(own, threads), poses, limits, threads)
-        points.append(found.points)
-        seen.append(own.of(RowLists.by_label(found.points_seen, len(found.points))))
-    return np.concatenate(points), _concatenate(seen)
-
-
-def _concatenate(parts: Sequence[RowLists]) -> RowLists:
-    lengths = np.concatenate([part.lengths() for part in parts])
-    return RowLists(offsets_of(lengths), np.concatenate([part.rows for part in parts]))
+    found = triangulate_tracks(matched.observed(joined, threads), poses, limits, threads)
+    return found.points, joined.of(RowLists.by_label(found.points_seen, len(found.points)))
 
 
 @inner_kernel

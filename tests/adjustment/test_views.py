@@ -17,7 +17,7 @@ from sfm_shapefit.adjustment.solve import reprojection_errors_px
 from sfm_shapefit.adjustment.sources import collect_matches
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.geometry import fit_similarity
-from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of
+from sfm_shapefit.files.colmap.points import ModelKeypoints, points2d_of, points_of, structure_of
 from sfm_shapefit.scene.images import Sensors
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.structure_options import StructureOptions
@@ -245,7 +245,8 @@ def test_matches_of_several_lenses_are_collected_batch_by_batch_by_any_number_of
         for pair, keypoints in zip(every, own, strict=True)
     ]
     place = np.where(np.arange(images.num_images) == 2, -1, np.arange(images.num_images))
-    found = collect_matches(images, pictures, place, batches, 6 * len(batches), threads)
+    room = np.empty((6 * len(batches), 2), dtype=np.uint32)
+    found = collect_matches(images, pictures, place, batches, room, threads)
 
     at = np.stack([found.cameras, found.keypoints], axis=1)
     expected = [
@@ -260,12 +261,12 @@ def test_matches_of_several_lenses_are_collected_batch_by_batch_by_any_number_of
         np.testing.assert_array_equal(found.on_plane[rows], pictures.rays(image, pixels)[:, :2])
 
 
-@pytest.mark.parametrize("exact", [False, True])
-def test_pixels_of_matches_are_held_in_32_bits_only_if_these_hold_all_of_them(exact):
+@pytest.mark.parametrize(("exact", "more"), [(False, 1e-9), (False, 1e60), (True, 0.0)])
+def test_pixels_of_matches_are_held_in_32_bits_only_if_these_hold_all_of_them(exact, more):
     model = scene()
     for image in model.images.values():
         for k, point in enumerate(image.points2D):
-            wanted = np.float32(point.xy) if exact or image.image_id > 2 or k else point.xy + 1e-9
+            wanted = np.float32(point.xy) if exact or image.image_id > 2 or k else point.xy + more
             image.points2D[k].xy = wanted.astype(np.float64)
     found = matches_of(model)
     assert found.pixels.dtype == (np.float32 if exact else np.float64)
@@ -273,6 +274,9 @@ def test_pixels_of_matches_are_held_in_32_bits_only_if_these_hold_all_of_them(ex
     pixels = [np.array([point.xy for point in model.image(one).points2D]) for one in ids]
     at = [pixels[i][k] for i, k in zip(found.cameras.tolist(), found.keypoints.tolist(), strict=True)]
     np.testing.assert_array_equal(found.pixels, at)
+    seen = structure_of(arrays(model), posed_images(model))
+    at = [pixels[i][k] for i, k in zip(seen.points.images, seen.points.keypoints, strict=True)]
+    np.testing.assert_array_equal(seen.pixels[:], at)
 
 
 @pytest.mark.parametrize("source", ["matches", "tracks"])

@@ -10,6 +10,7 @@ from sfm_shapefit import LocateOptions
 from sfm_shapefit.adjustment.sources import collect_matches
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.clock import Clock
+from sfm_shapefit.base.row_file import RowFile
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import ModelKeypoints, points_of
@@ -42,7 +43,7 @@ def found(ring_located):
     return ring_located
 
 
-def counted_at(images, points, apart=NO_PAIRS):
+def counted_at(images, points, apart=NO_PAIRS, make_rows=np.empty):
     model, options = read_model(RING / "sparse" / "0"), LocateOptions()
     inputs = choose_inputs(RING / "sparse" / "0", RING / "database.db", "auto")
     with open_source(model, inputs) as source:
@@ -51,12 +52,13 @@ def counted_at(images, points, apart=NO_PAIRS):
         is_apart = is_among(view.pairs, apart)
         for batches in (view.links(chosen=is_apart), view.links(chosen=~is_apart)):
             pictures = ModelKeypoints(images, view.keypoints)
-            counted.add(collect_matches(images, pictures, every, batches, view.num_matches), poses)
+            room = make_rows((view.num_matches, 2), dtype=np.uint32)
+            counted.add(collect_matches(images, pictures, every, batches, room, 2), poses)
     return counted.compare(points)
 
 
-def shares_at(images, points, apart=NO_PAIRS):
-    return counted_at(images, points, apart).shares(images.is_posed)
+def shares_at(images, points, apart=NO_PAIRS, make_rows=np.empty):
+    return counted_at(images, points, apart, make_rows).shares(images.is_posed)
 
 
 def arrays_of(found):
@@ -70,7 +72,7 @@ def test_observations_of_right_cameras_agree(found):
     assert shares == found.support.observations
     assert shares.observations > 0.9
     assert shares.contradicting < 0.01
-    assert shares_at(*arrays_of(found), apart=np.array([[1, 0], [2, 3]])) == shares
+    assert shares_at(*arrays_of(found), np.array([[1, 0], [2, 3]]), RowFile) == shares  # matches in a file
 
 
 def judged_at(source, **options):

@@ -224,7 +224,7 @@ def test_an_adjustment_on_few_tracks_takes_what_is_forecast():
     counts = {"num_keypoints": observed, "num_matches": 2 * observed}
     work = replace(nothing, **counts, num_pairs=len(layout.pairs) // 2, factor_entries=entries // 2)
     full, empty = (forecast(one).memory_mb["adjusting a first placement"] for one in (work, nothing))
-    # The forecast has .95 of these pairs and of this factor, two copies of it and a fifth; the inverse takes
+    # The forecast has .95 of these pairs and of this factor, two copies of it; the inverse takes
     # as much as the factor, and what else there is next to nothing.
     assert 0.9 * taken_mb < full - empty < 1.3 * taken_mb
 

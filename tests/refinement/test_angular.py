@@ -234,6 +234,13 @@ def test_shares_and_levels_of_a_mixture_are_those_of_its_own_posteriors():
     np.testing.assert_allclose(mixture.variances - own, mixture.variances[0] - own[0], rtol=1e-9)
 
 
+def test_a_mixture_finds_the_right_pairs_whatever_the_dimension():
+    """The density of right directions in 400 dimensions is beyond the largest number, or below the least."""
+    problem = synthetic.random_graph_problem(20, 1.0, 400, sigma=0.001, q=0.2, seed=0)
+    mixture = fit_mixture(MeasuredGraph(problem.view_graph), problem.locations)
+    assert mixture.shares[0] == pytest.approx(1.0 - problem.corrupted.mean(), abs=1e-3)
+
+
 def test_each_class_finds_its_own_level_and_keeps_it_while_it_is_not_fitted():
     rng = np.random.default_rng(0)
     problem = synthetic.random_graph_problem(60, 0.8, seed=1)

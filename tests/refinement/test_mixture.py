@@ -304,3 +304,11 @@ def test_the_design_effect_is_one_where_cameras_step_alike_and_large_where_the_s
     lengths = np.linalg.norm(np.diff(problem.locations[graph.edges], axis=1)[:, 0], axis=1)
     logs = np.log(lengths)
     assert least <= LengthPrior(graph).design_effect(logs - logs.mean()) <= most
+
+
+def test_the_rounding_that_averages_leave_says_nothing_of_how_cameras_step():
+    """Each average of four cameras that all see each other cancels as much as the one before."""
+    graph = synthetic.random_graph_problem(4, 1.0, seed=0).view_graph
+    logs = np.random.default_rng(0).normal(0.0, 0.4, (40, graph.num_edges))
+    effects = [LengthPrior(graph).design_effect(own - own.mean()) for own in logs]
+    assert max(effects) < 4.0  # 15 where rounding counts

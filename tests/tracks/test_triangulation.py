@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.adjustment.solve import adjust, choose_loss_scale_px
+from sfm_shapefit.base.row_file import RowFile
+from sfm_shapefit.tracks.joining import list_trees
 from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.thin_tracks import choose_thin_tracks
 from sfm_shapefit.tracks.triangulation import (
@@ -226,7 +228,37 @@ def test_without_chains_matches_are_joined_once():
     np.testing.assert_array_equal(in_turn.points, expected.points)
     of_points = at_once.of_points(expected.points_seen)
     for name in ("offsets", "cameras", "keypoints", "pixels", "ids"):
-        np.testing.assert_array_equal(getattr(joined, name), getattr(of_points, name))
+        np.testing.assert_array_equal(getattr(joined, name)[:], getattr(of_points, name))
+
+
+def test_matches_in_a_file_join_the_same_tracks_and_no_observation_is_copied():
+    tracks, poses, _ = made(noise_px=0.3, num_points=300)
+    rng = np.random.default_rng(5)
+    wrong = rng.integers(0, len(tracks.cameras), (3000, 2))  # so that there are chains to join anew
+    found = matched(tracks, wrong[tracks.cameras[wrong[:, 0]] != tracks.cameras[wrong[:, 1]]])
+    file = RowFile(found.matches.shape, dtype=found.matches.dtype)
+    file[0 : len(found.matches)] = found.matches
+    in_file, wide = replace(found, matches=file), replace(LIMITS, max_error_px=16.0)
+    np.testing.assert_array_equal(in_file.count_partners(), found.count_partners())
+    (joined, expected), (other, placed) = (
+        triangulate_matches(one, poses, wide, 4.0) for one in (found, in_file)
+    )
+    assert joined.matched is found
+    assert joined.rows.dtype == np.int32
+    np.testing.assert_array_equal(other.rows, joined.rows)
+    np.testing.assert_array_equal(other.offsets, joined.offsets)
+    np.testing.assert_array_equal(placed.points, expected.points)
+    # tracks of the points that are seen, some of their observations left out, as of copies
+    seen = np.where(rng.random(len(joined.rows)) < 0.2, -1, expected.points_seen)
+    few, copied = joined.of_points(seen), found.observed(joined).of_points(seen)
+    for name in ("offsets", "cameras", "keypoints", "pixels", "ids"):
+        np.testing.assert_array_equal(getattr(few, name)[:], getattr(copied, name))
+
+
+def test_joined_keypoints_are_the_components_of_their_forest():
+    parents = np.array([0, 0, 2, 1, 2, 5, 4], dtype=np.int32)
+    assert [own.tolist() for own in list_trees(parents)] == [[0, 1, 3], [2, 4, 6]]
+    assert len(list_trees(np.arange(3, dtype=np.int32)).rows) == 0
 
 
 def test_tracks_of_points_are_the_rows_that_see_each():

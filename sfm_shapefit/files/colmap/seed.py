@@ -158,7 +158,7 @@ class SeededModel:
         own = dict(
             zip(model.images.rows(self.images.ids).tolist(), range(self.images.num_images), strict=True)
         )
-        rows_of, ids = self.points.rows_of_images(self.images.num_images), self.points.ids
+        rows_of, ids = list(self.points.rows_of_images(self.images.num_images)), self.points.ids
         seen = self.points.points_seen()
 
         def of_image(row: int) -> Records:
