@@ -4,20 +4,18 @@ images and lenses -> features -> pairs -> matches and two-view geometries
 """
 
 import warnings
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, distinct_pairs
+from sfm_shapefit.base.arrays import IntArray, distinct_pairs
 from sfm_shapefit.base.clock import Clock, Progress
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.paths import MASKS, OF_DATABASE, refuse_no_folder
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.base.wording import first_of
-from sfm_shapefit.files.colmap.database_images import read_images
-from sfm_shapefit.files.colmap.known import read_priors
+from sfm_shapefit.commands.photograph_pairs import NO_PAIRS, near_pairs, pairing_of, read_places
 from sfm_shapefit.files.colmap.photographs import (
     PhotographDatabase,
     check_rigs,
@@ -27,10 +25,8 @@ from sfm_shapefit.files.colmap.photographs import (
 )
 from sfm_shapefit.files.colmap.picture_matches import read_descriptors
 from sfm_shapefit.files.colmap.priors import MissingPriorsError
-from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.files.matching_options import MATCHING_FILE, MOST_EXHAUSTIVE, MatchingOptions
-from sfm_shapefit.judgement.chosen_pairs import NEAR_A_STEP, NUM_DESCRIBED, alike_pairs, nearest_pairs
-from sfm_shapefit.scene.sequences import find_sequences
+from sfm_shapefit.files.matching_options import MATCHING_FILE, MatchingOptions
+from sfm_shapefit.judgement.chosen_pairs import NUM_DESCRIBED, alike_pairs
 from sfm_shapefit.solver.solver_options import SolverOptions
 
 _ALIKE, _ALIKE_BESIDE = 30, 5
@@ -107,14 +103,12 @@ def begin_database(
         raise InputError(f"{folder} has no two images that pycolmap can read; not {first_of(unreadable)}")
     if options.pairing == "spatial" and priors is None:
         try:
-            _read_places(made, OF_DATABASE)
+            read_places(made, OF_DATABASE)
         except MissingPriorsError:
             if is_new:
                 _remove(path, with_folder=not has_folder)
-            raise InputError(
-                "pairing=spatial needs positions, and the EXIF data of the images have none; give a table "
-                "(priors=FILE)"
-            ) from None
+            lack = "pairing=spatial needs positions, and the EXIF data of the images have none"
+            raise InputError(f"{lack}; give a table (priors=FILE)") from None
     if unused := [*found.unread, *unreadable]:
         notes.append(f"not used, since pycolmap cannot read them: {first_of(unused)} in {folder}")
     return made, notes
@@ -129,47 +123,15 @@ def _remove(database: Path, *, with_folder: bool) -> None:
 
 def match_begun(made: PhotographDatabase, clock: Clock, priors: Path | str | None = None) -> list[str]:
     """Write the features and matches that a database lacks; return notes; `priors` as of `match_images`."""
-    names = made.known_names()
-    pairing, rows, notes = _pairing_of(names, made.options), np.arange(len(names)), list[str]()
-    near = np.zeros((0, 2), dtype=np.int64)
-    if pairing == "spatial":
-        rows, positions = _read_places(made, priors or OF_DATABASE)
-        near = np.sort(rows[nearest_pairs(positions, NEAR_A_STEP * made.options.overlap)], axis=1)
-    lost = np.setdiff1d(np.arange(len(names)), rows)
-    if len(lost):
-        whom = "those that look alike"
-        if len(names) <= MOST_EXHAUSTIVE:
-            whom = "all others"
-            every = np.column_stack(np.triu_indices(len(names), 1))
-            near = distinct_pairs(np.concatenate([near, every[np.isin(every, lost).any(axis=1)]]))
-        has, are = ("has", "it is") if len(lost) == 1 else ("have", "they are")
-        which = f"{len(lost):,} of {len(names):,} images {has} no position, such as {names[lost[0]]}"
-        notes.append(f"{which}: {are} matched with {whom}")
+    pairing = pairing_of(made.known_names(), made.options)
+    near, lost, notes = near_pairs(made, priors or OF_DATABASE) if pairing == "spatial" else NO_PAIRS
     with clock("features"):
         made.detect(clock.advance)
     with clock("matches"):
         if len(near):
             made.match_pairs(near, clock.advance)
         _match(made, pairing, lost, clock)
-    return notes
-
-
-def _read_places(made: PhotographDatabase, priors: Path | str) -> tuple[IntArray, FloatArray]:
-    """Return the images that have a position (k,), as rows of the names of the database, and these (k, 3)."""
-    with closing(DatabaseFile(made.database)) as file:
-        images = read_images(file).images
-        known = read_priors(images, file, priors).known
-    row_of = {name: row for row, name in enumerate(made.known_names())}
-    return np.array([row_of[name] for name in images.names_of(known.indices)]), known.positions
-
-
-def _pairing_of(names: list[str], options: MatchingOptions) -> str:
-    if options.pairing != "auto":
-        return options.pairing
-    if len(names) <= MOST_EXHAUSTIVE:
-        return "exhaustive"
-    numbered = sum(len(rows) for rows, _ in find_sequences(names))
-    return "sequential" if numbered == len(names) else "retrieval"
+    return list(notes)
 
 
 def _match(made: PhotographDatabase, pairing: str, lost: IntArray, clock: Clock) -> None:

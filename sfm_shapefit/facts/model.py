@@ -184,12 +184,14 @@ class FactsOfModel(Facts):
             f"{against[0]:,} of {counted(against[1], 'pair')} contradict{'s' * (against[1] == 1)} the result"
         )
         contradict = contradict if against[1] else "no pair determines where cameras are"
-        if num_rejected:
-            others = f"{num_rejected:,}{' more' * bool(against[1])} contradict{'s' * (num_rejected == 1)}"
-            contradict += f", and {others} its rotations"
         silent = self.num_pairs - against[1] - num_rejected
-        if silent > against[1] > 0:
-            contradict += f", and {silent:,} of {self.num_pairs:,} pairs say nothing of it"
+        if self.num_pairs - against[1] > against[1] > 0:
+            if num_rejected:
+                contradict += (
+                    f", and {num_rejected:,} more contradict{'s' * (num_rejected == 1)} its rotations"
+                )
+            if silent:
+                contradict += f", and {silent:,} of {self.num_pairs:,} pairs say nothing of it"
         return [
             f"{self.num_placed:,} of {counted(self.num_images, 'image')} placed, "
             f"{counted(self.num_points, 'point')}{points}",

@@ -433,9 +433,7 @@ def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
         lambda: sfm_shapefit.map_database(RING / "database.db", rigs="free"),
         lambda: sfm_shapefit.locate(RING / "sparse" / "0", rigs="free"),
     ):
-        with pytest.raises(
-            InputError, match="no rig of several cameras with poses to refine; leave out rigs=free"
-        ):
+        with pytest.raises(InputError, match=r"no rig of several cameras .*to refine; leave out rigs=free"):
             call()
     with pytest.raises(ValueError, match="rigs=free needs an adjustment"):
         LocateOptions(rigs="free", adjust="none")
