@@ -123,6 +123,7 @@ def test_what_map_doubts_check_does_not_call_good():
             "another place or rotation has at least half as much evidence"
             in found.facts.evidence.second.statement
         )
+        assert "median" not in found.facts.evidence.second.statement
         assert " workspace " in found.facts.next_step.command  # it would be placed there again
         assert banner(draw_checked(found), found.facts)["sentence"].startswith(
             "0004.jpg, 0005.jpg may be wrong"
