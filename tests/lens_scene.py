@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from sfm_shapefit.base.arrays import FloatArray
+
 MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
 _EXTRA = {"EUCM": [0.4, 1.1], "FOV": [0.5], "SIMPLE_DIVISION": [-0.05], "DIVISION": [-0.05]}
 _SENSOR = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.1, 0.0, 0.995])), np.array([0.3, 0.1, -0.2]))
@@ -31,14 +33,16 @@ def write_scene(
     rig: bool = False,
     behind: bool = False,
     poses: Sequence[pycolmap.Rigid3d] | None = None,
+    points: FloatArray | None = None,
 ) -> pycolmap.Reconstruction:
     """Write the true model, sparse/0, and database.db; return the model.
 
     Frames take the cameras in turn, or are those of a rig of all cameras; the points are before or behind
-    them, unless poses are given. A panorama goes on at its other edge.
+    them, unless poses, or points (n, 3), are given. A panorama goes on at its other edge.
     """
     model, noise = pycolmap.Reconstruction(), np.random.default_rng(8)
-    points = np.random.default_rng(7).uniform(-2.0, 2.0, (120, 3))
+    if points is None:
+        points = np.random.default_rng(7).uniform(-2.0, 2.0, (120, 3))
     for camera in cameras:
         model.add_camera(camera)
     for group in [cameras] if rig else [[camera] for camera in cameras]:

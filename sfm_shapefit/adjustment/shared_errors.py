@@ -193,7 +193,7 @@ class _Pulls:
         self.problem, self.system = problem, system
         self.given = kernel_inputs(system.layout, values_of(problem), options.loss_scale_px)
         self.windows = _windows(problem)
-        self.groups = _group_neighbors(problem.points)
+        self.groups = group_neighbors(problem.points)
         self.workers = Workers(options.threads)
 
     def draw(
@@ -317,7 +317,7 @@ def _windows(problem: AdjustmentProblem) -> FloatArray:
     return np.ascontiguousarray(windows[problem.lens_of_camera])
 
 
-def _group_neighbors(points: FloatArray) -> IntArray:
+def group_neighbors(points: FloatArray) -> IntArray:
     """Return the group of each point (k,): halved along the longest axis until there are enough groups."""
     groups = np.zeros(len(points), np.int64)
     count = 1

@@ -114,7 +114,7 @@ def _writers() -> Writers:
 
 
 class Reported(Displayed):
-    """A result that has a report."""
+    """A result that has a report and tells lengths."""
 
     __slots__ = ()
 
@@ -131,6 +131,20 @@ class Reported(Displayed):
         """
         return _writers().page(self, page, images=images, overwrite=overwrite)
 
+    def length(self, first: str | int, second: str | int) -> Any:
+        """Return the distance of two images or points and how well it is known, see `evaluate_lengths`.
+
+            print(found.length("0001.jpg", "0004.jpg"))  # 2.503 ± 0.004 m (95 %), worst direction ...
+
+        Args:
+            first, second: names of images, whose centers are meant, or ids of 3D points.
+
+        Raises:
+            InputError: if there is no such image or point, or the result has no model.
+            UnsolvableError: if nothing is known of the errors.
+        """
+        return _writers().length(self, first, second)
+
 
 class Written(Reported):
     """A result that can be written as the folder that the command would make."""
@@ -141,20 +155,6 @@ class Written(Reported):
 
     def __dir__(self) -> Iterable[str]:
         return sorted({*self._PUBLIC, "facts", "length", "report", "summary", "verdict", "write"})
-
-    def length(self, first: str | int, second: str | int) -> Any:
-        """Return the distance of two images or points and how well it is known, see `evaluate_lengths`.
-
-            print(found.length("0001.jpg", "0004.jpg"))  # 2.503 ± 0.004 (95 %), worst direction ...
-
-        Args:
-            first, second: names of images, whose centers are meant, or ids of 3D points.
-
-        Raises:
-            InputError: if there is no such image or point, or the result has no model.
-            UnsolvableError: if nothing is known of the errors.
-        """
-        return _writers().length(self, first, second)
 
     def write(self, out: Path | str, **options: Any) -> Path:
         """Write the result into a new or empty folder, which is filled in one step, and return it.

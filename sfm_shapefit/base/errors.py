@@ -17,4 +17,4 @@ class MissingExtraError(ShapeFitError):
     """A package that one option needs is not installed."""
 
     def __init__(self, what: str, package: str, extra: str) -> None:
-        super().__init__(f"{what} needs {package}: pip install '.[{extra}]' in the folder of sfm_shapefit")
+        super().__init__(f"{what} needs {package}: pip install -e '.[{extra}]' in the folder of sfm_shapefit")

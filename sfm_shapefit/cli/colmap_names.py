@@ -90,7 +90,7 @@ _NEEDLESS = {
         ("refine_principal_point", "ba_refine_principal_point"), "the principal point stays, so leave it out"
     ),
     "multiple_models": "the largest model is OUT/0, so leave it out",
-    "max_num_models": "nothing is grown from a first pair, so leave it out",
+    "max_num_models": "images are placed and adjusted all at once, so leave it out",
     **dict.fromkeys(
         ("input_path", "input_path1", "input_path2", "output_path"),
         "here paths go by their place, without a flag",

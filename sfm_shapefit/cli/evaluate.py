@@ -1,8 +1,8 @@
-"""`sfm-shapefit evaluate MODEL REF`."""
+"""`sfm-shapefit evaluate MODEL [REF]`."""
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -30,9 +30,14 @@ _WORST_SHOWN = 3  # cameras with the largest errors that the terminal names; --c
 _TABLES = {".csv", ".txt"}
 
 
+class _OptionalReference(GroupedCommand):
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        return [f"[{one}]" if one == "REF" else one for one in super().collect_usage_pieces(ctx)]
+
+
 @app.command(
     "evaluate",
-    cls=GroupedCommand,
+    cls=_OptionalReference,
     short_help="Compare a model's poses with a reference, or MODEL with control points or scale bars.",
     epilog="Example: sfm-shapefit evaluate out truth --csv errors.csv",
 )

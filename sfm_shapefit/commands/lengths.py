@@ -46,7 +46,7 @@ def evaluate_lengths(
 
         found = evaluate_lengths("sparse/0", [("0001.jpg", "0004.jpg"), (17, 402)], scale_bars="bars.txt")
         print(found.usual.statement)
-        print(found.lengths[0].length.interval)            # 2.503 ± 0.004 (95 %), worst direction ...
+        print(found.lengths[0].length.interval)            # 2.503 ± 0.004 m (95 %), worst direction ...
 
     The errors are those that the pixels show where the model stands: noise, rotations, calibration. That of
     the scale is included where the model knows it, as one of `locate` does.

@@ -125,16 +125,16 @@ def workspace(
             _refuse_no_masks(flats, masks)
             for name in ("images", "masks") if masks else ("images",):
                 (folder / name).mkdir()
-            reasons = dict.fromkeys(missing, "no picture")
+            reasons = dict.fromkeys(missing, "not found")
             for done, why in enumerate(write_flats(flats, folder, clock.threads, masks)):
                 reasons |= {flats[done].name: why} if why else {}
                 clock.advance(done + 1, len(flats))
             flats = [flat for flat in flats if flat.name not in reasons]
             if len(flats) < 2:
                 name, why = next(iter(reasons.items()))
-                count = "only one" if flats else "no"
+                count = "only one" if flats else "none"
                 raise InputError(
-                    f"{images} has {count} picture of the model ({name}: {why}); give the folder of those "
+                    f"{images} has {count} of the model's images ({name}: {why}); give the folder of those "
                     f"that it was made of{', and their masks' if masks else ''}"
                 )
         with clock("model"):

@@ -73,11 +73,11 @@ class LengthFacts(Record):
     def interval(self) -> str:
         """The length with its interval, and the worst direction, in words."""
         along = name_direction(np.array(self.worst_direction), has_up=self.has_up)
-        within, digits = within_95(self.length, self.half_width), digits_of(self.half_width)
+        within, digits = within_95(self.length, self.half_width, f" {self.unit}"), digits_of(self.half_width)
         return f"{within}, worst direction {along} (± {self.worst_half_width:.{digits}f})"
 
     def __str__(self) -> str:
-        return self.interval
+        return self.interval + ("" if self.has_scale else "; the scale is open")
 
     def said(self, half_width: float) -> str:
         """Return half an interval in two digits, of meters in the unit that suits it."""
@@ -131,10 +131,10 @@ def digits_of(half_width: float) -> int:
     return max(1 - math.floor(math.log10(half_width)), 0) if half_width > 0.0 else 6
 
 
-def within_95(length: float, half_width: float) -> str:
-    """Return a length with the interval that holds it with a probability of 95 %, in words."""
+def within_95(length: float, half_width: float, unit: str = "") -> str:
+    """Return a length with the interval of 95 % in words; a unit begins with a blank."""
     digits = digits_of(half_width)
-    return f"{length:.{digits}f} ± {half_width:.{digits}f} (95 %)"
+    return f"{length:.{digits}f} ± {half_width:.{digits}f}{unit} (95 %)"
 
 
 def name_direction(direction: FloatArray, *, has_up: bool) -> str:

@@ -64,7 +64,7 @@ class ScaleBar(Record):
         if not found:
             return f"{name}: known {known}, not found; {marks} marks agree"
         off = f"{error} ({sigmas} sigmas)" if sigmas else error
-        return f"{name}: known {known}, found {found}, off by {off}; {use}"
+        return f"{name}: known {known}, found {found}, off by {off}; {use}{' bar' * (self.use == 'check')}"
 
 
 class MeasuredBars(NamedTuple):

@@ -108,6 +108,8 @@ class SecondOpinion(Record):
         usual = f"the median difference of positions is {percent} % of their spread"
         if self.wrong or self.undecided:
             usual += f", and the largest {rounded(100.0 * self.farthest, digits=2)} %"
+        if parts and not (self.wrong or self.undecided or self.has_nothing_in_common):
+            return parts[0]
         if self.has_nothing_in_common:
             return f"{self.num_common} cameras have nothing in common with their places {by} ({usual})"
         told = "; ".join(parts) or f"{self.num_common} cameras are in the same place {by}"

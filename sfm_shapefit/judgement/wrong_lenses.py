@@ -94,9 +94,9 @@ class ContradictedLens(Record):
         asked = f"{self.asked_focal_px:,.0f} ± {self.asked_sigma_px:,.0f} px"
         if abs(self.asked_focal_px - self.focal_px) < _UNLIKE * self.asked_sigma_px:
             return (
-                f"the focal length of {self.label}, {self.focal_px:,.0f} px, is doubtful: its "
-                f"{self.num_images} images ask for unlike ones by the points that the others make ({asked}), "
-                "so that the lens or the places of images are wrong"
+                f"the focal length of {self.label}, {self.focal_px:,.0f} px, is doubtful: by the points "
+                f"that the others make, its {self.num_images} images ask for lengths that differ ({asked}), "
+                "so the lens or the places of images are wrong"
             )
         who = "its image asks" if self.num_images == 1 else f"its {self.num_images} images ask"
         return (

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.adjustment.lens_doubts import excess
+from sfm_shapefit.adjustment.missing_distortion import find_missing_distortion
 from sfm_shapefit.adjustment.open_shape import estimate_open_shape
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
@@ -17,11 +18,12 @@ from sfm_shapefit.files.colmap.intrinsics import calibrated_focals
 from sfm_shapefit.files.colmap.lenses import is_bogus
 from sfm_shapefit.files.colmap.points import ModelKeypoints
 from sfm_shapefit.judgement.duplicates import find_split_duplicates
-from sfm_shapefit.judgement.evidence import ModelEvidence, OpenShape
+from sfm_shapefit.judgement.evidence import ModelEvidence, OddImages, OpenShape
 from sfm_shapefit.judgement.lens_questions import ask_points
 from sfm_shapefit.judgement.lenses import find_changed_lenses
 from sfm_shapefit.judgement.limits import CHANCE_SHARE, SMALLEST_SHAPE
 from sfm_shapefit.judgement.pair_fits import PairFits, fit_pairs
+from sfm_shapefit.judgement.reasons import Kind
 from sfm_shapefit.judgement.resolutions import find_outside
 from sfm_shapefit.judgement.rig_offsets import find_contradicted_rigs
 from sfm_shapefit.judgement.seams import GroupApart, find_cuts, find_seams
@@ -36,6 +38,10 @@ from sfm_shapefit.scene.lens import Origin
 from sfm_shapefit.scene.structure import Structure
 from sfm_shapefit.tracks.links import ObservedTracks
 
+_MISSES_DISTORTION = (
+    "a lens without distortion, though its points show one: with it, cameras move by {} % of their usual "
+    "distance from the middle; use --camera-model SIMPLE_RADIAL, or COLMAP's --ImageReader.camera_model"
+)
 _OPEN = 1e100  # squared units; larger covariances overflow, and mean that nothing holds a camera
 
 
@@ -96,7 +102,9 @@ def question(state: ModelState, clock: Clock) -> ModelEvidence:
     source = replace(source, tied=_tied_by_priors(state, images))
     found, gauge = gather_evidence(source, fits, structure, clock.threads), state.gauge
     places = (one.moved(gauge.similarity.scale, gauge.axes) for one in found.places)
-    return with_known_lenses(replace(found, places=tuple(places)), source, state.images)
+    inputs, found = state.inputs, replace(found, places=tuple(places))
+    held = {"rotations_held": inputs.knows_rotations, "shape_held": _is_shape_held(state)}
+    return with_known_lenses(found, source, structure, clock.threads, **held)
 
 
 def confirm_by_pixels(state: ModelState) -> BoolArray:
@@ -114,12 +122,32 @@ def confirm_by_pixels(state: ModelState) -> BoolArray:
     return images.are_named(ask_pixels(source, Structure(state.points, images, pictures), names))
 
 
-def with_known_lenses(evidence: ModelEvidence, source: MatchSource, images: Images) -> ModelEvidence:
-    """Return the evidence with focal lengths that are far from those given, or known to a database."""
-    matches, lenses = source.matches, enumerate(images.lenses)
+def with_known_lenses(
+    evidence: ModelEvidence,
+    source: MatchSource,
+    structure: Structure,
+    threads: int,
+    *,
+    rotations_held: bool = False,
+    shape_held: bool = False,
+) -> ModelEvidence:
+    """Return the evidence with lenses that miss a distortion, and focal lengths far from those known.
+
+    These were given, or a database has them. Where the shape is held, no distortion is asked for.
+    """
+    images, matches, among = structure.images, source.matches, structure.among
+    if among is not None:
+        images = images.part(np.flatnonzero(images.is_posed & among))
     known_px = calibrated_focals(matches.file, images) if isinstance(matches, DatabaseMatches) else {}
+    lenses = enumerate(images.lenses)
     known_px |= {k: one.as_given().focal_px for k, one in lenses if one.origin is Origin.CALIBRATION}
-    return replace(evidence, odd=(*evidence.odd, *find_changed_lenses(images, known_px)))
+    odd = [*evidence.odd, *find_changed_lenses(images, known_px)]
+    if not shape_held:
+        bent, share = find_missing_distortion(structure, rotations_held=rotations_held, threads=threads)
+        if len(bent):
+            shares, names = np.full(len(bent), 100.0 * share), structure.images.names_of(bent)
+            odd.append(OddImages.of_values(Kind.LENS, names, shares, _MISSES_DISTORTION))
+    return replace(evidence, odd=tuple(odd))
 
 
 def with_left_out(state: ModelState) -> Images:
@@ -141,17 +169,21 @@ def _tied_by_priors(state: ModelState, images: Images) -> IntArray | None:
     return rigid_strip(images, np.isin(images.frame_of, frames) & images.is_posed)
 
 
+def _is_shape_held(state: ModelState) -> bool:
+    """Return whether priors or fixed images hold the shape, whatever the points and lenses are."""
+    return state.held is not None or bool(state.inputs.fixed.any())
+
+
 def shape_of(state: ModelState, threads: int) -> OpenShape | None:
     """Return what own tracks leave open of the delivered images, where nothing else holds their shape."""
     inputs, images = state.inputs, state.images
-    if state.source.has_database or state.held is not None or inputs.fixed.any():
+    if state.source.has_database or _is_shape_held(state):
         return None
     links, lenses_held = (
         state.read_links(images, nobody, threads),
         inputs.options.freedom.intrinsics == "held",
     )
-    knows_rotations = inputs.pull_rad is not None and inputs.pull_rad < np.inf
-    held = {"lenses_held": lenses_held, "rotations_held": knows_rotations}
+    held = {"lenses_held": lenses_held, "rotations_held": inputs.knows_rotations}
     return ask_shape(images, images.posed_rows, links, threads, **held)
 
 

@@ -64,6 +64,7 @@ def turn_about_origin(rotation: FloatArray) -> Similarity:
     return Similarity(scale=1.0, rotation=rotation, translation=np.zeros(3))
 
 
+_ROUNDING = 1e-9  # degrees, and share of the coordinates; less is not told
 _NAMED = 3  # images; of more with a wrong gravity only the worst are named
 
 
@@ -127,8 +128,9 @@ def compare_control_points(
         own, alignment = found.positions[fit.fitting], fit.motion.facts
         moved = float(np.linalg.norm((fit.motion.apply(own) - own).mean(axis=0)))
         turned = rotation_angles_deg(fit.motion.rotation[None])[0]
-        onto = f"after a similarity onto {counted(len(own), 'control point')}"
-        how = f"{onto}: scale {alignment.scale:.6g}, turned by {turned:.3g} deg, moved by {moved:.3g}"
+        how = f"after a similarity onto {counted(len(own), 'control point')}: scale {alignment.scale:.6g}"
+        how += f", turned by {turned:.3g} deg" if turned > _ROUNDING else ""
+        how += f", moved by {moved:.3g}" if moved > _ROUNDING * np.abs(own).max() else ""
     rows = tuple(control_rows(known, found, fit))
     compared = ControlComparison(
         statement=f"{known.statement}; {how}",

@@ -111,6 +111,11 @@ class RunInputs:
     """What the user knows of the images beside the matches."""
 
     @property
+    def knows_rotations(self) -> bool:
+        """Whether the user knows rotations, so that an adjustment holds them or pulls them back."""
+        return self.pull_rad is not None and self.pull_rad < np.inf
+
+    @property
     def fixed_frames(self) -> BoolArray:
         """Frames that keep their poses to the last bit, (f,)."""
         fixed = np.zeros(len(self.images.frames.ids), dtype=np.bool_)

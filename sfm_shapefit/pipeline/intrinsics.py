@@ -61,7 +61,7 @@ def choose_intrinsics(
     for k in np.flatnonzero(by_view_graph).tolist():
         lenses[k] = lenses[k].longer(factors[k])
     if file is not None:
-        file.notes += _contradicted_guesses(images.lenses, lenses, guessed, by_pairs)
+        file.notes += _contradicted_guesses(images.lenses, lenses, guessed, by_pairs, held=wanted == "held")
     parts = np.array(may_move, dtype=np.bool_) & np.isin(list(PARTS), PARTS_FREED[wanted])
     return images.with_lenses(lenses), intrinsics_in_doubt(parts, by_view_graph)
 
@@ -92,6 +92,8 @@ def _contradicted_guesses(
     lenses: Sequence[Lens],
     guessed: Mapping[int, Uncalibrated],
     by_pairs: Mapping[int, PairFocal],
+    *,
+    held: bool,
 ) -> Iterator[str]:
     """Yield which lenses start from another focal length than their pairs were verified with, if any do."""
     named = []
@@ -105,7 +107,8 @@ def _contradicted_guesses(
                 f"{one.num_pairs} of camera {lenses[k].id} with {asked_px:,.0f} px, not {focal_px:,.0f}"
             )
     if named:
+        remedy = "intrinsics=auto lets these change" if held else "check those that are found"
         yield (
             "COLMAP verified pairs with other focal lengths than their guessed lenses start from: "
-            f"{first_of(named)}; intrinsics=auto lets these change"
+            f"{first_of(named)}; {remedy}"
         )

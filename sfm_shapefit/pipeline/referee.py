@@ -116,7 +116,7 @@ def gather_evidence_against(state: CheckState, clock: Clock) -> CheckState:
     """Gather the evidence as `locate` does, with the open shape where nothing else has measured lenses."""
     source, structure = state.source, state.structure
     evidence = gather_evidence(source, state.fits, structure, clock.threads)
-    evidence = with_known_lenses(evidence, source, state.images)
+    evidence = with_known_lenses(evidence, source, structure, clock.threads)
     if source.inputs.is_made or not source.has_database:
         tracks = collect_tracks(state.images, structure.pictures, structure.points)
         rows = np.arange(state.images.num_images)

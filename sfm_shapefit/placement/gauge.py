@@ -320,7 +320,7 @@ def _fit_turning(source: FloatArray, priors: PositionPriors, free: Free, *, axes
         fit.motion,
         tells,
         turns,
-        _prior_statement(fit, turns=turns),
+        _prior_statement(fit, turns=turns, axes_known=axes_known),
         _prior_warning(fit.level, size, reading, on_line=on_line, turns=turns, tells_axes=tells),
     )
 
@@ -435,12 +435,13 @@ def _center(points: FloatArray, weights: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(weights)[:, None] * (points - mean))
 
 
-def _prior_statement(fit: PriorMotion, *, turns: bool) -> str:
+def _prior_statement(fit: PriorMotion, *, turns: bool, axes_known: bool) -> str:
     count, agreeing = len(fit.weights), int(np.sum(fit.weights >= 0.5))
     axes = "origin: theirs, axes: the input's"
     if turns:
         turn_deg = float(rotation_angles_deg(fit.motion.rotation))
-        axes = f"origin and axes: theirs, the input was turned by {turn_deg:.1f} deg"
+        axes = "origin and axes: theirs"
+        axes += f", the input was turned by {turn_deg:.1f} deg" if axes_known else ""
     agree = (
         f"{agreeing} of {count} agree"
         if count >= FEWEST_CHECKED

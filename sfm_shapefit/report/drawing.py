@@ -151,8 +151,8 @@ class Pairs:
         return np.bincount(ends[agrees], minlength=num_cameras), medians
 
     def worst_first(self) -> IntArray:
-        """Return the rows, those that contradict the solution most first, those without a direction last."""
-        rank = np.array([2, 0, 1, 4, 3])[self.classes]
+        """Return the rows: those that contradict the solution first, then rejected ones."""
+        rank = np.array([3, 0, 2, 4, 1])[self.classes]
         return np.asarray(np.lexsort((-self.support, -np.nan_to_num(self.residuals_deg), rank)))
 
 

@@ -139,6 +139,7 @@ def _certainty(drawing: Drawing, facts: Facts) -> Iterator[str]:
         return
     worst = int(np.argmax(np.where(drawing.cameras.placed, np.nan_to_num(drawing.cameras.sigmas), -1.0)))
     covers, _, relative = facts.sigma_of.removeprefix("adjusted: ").partition("; ")
+    covers = " and ".join(covers.rsplit(", ", 1))
     meaning = f" Uncertainties cover {covers}, {relative}." if covers else ""
     who = shorten(drawing.cameras.names[worst])
     sigma = in_unit(float(drawing.cameras.sigmas[worst]), facts.figures.unit, digits=2)

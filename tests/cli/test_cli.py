@@ -131,6 +131,7 @@ def test_other_commands_take_colmaps_names_of_paths_too(tmp_path):
         ("map a b --GlobalMapper.keep_max_num_tracks 9", "this command has nothing like it; leave it out"),
         ("check a --Mapper.min_num_matches 3", "this command has nothing like it; leave it out"),
         ("check a --Mapper.num_threads 3", "this command has nothing like it; leave it out"),
+        ("map a b --Mapper.ba_global_function_tolerance 0", "images are placed and adjusted all at once"),
         ("map a b --project_path x.ini", "here it is --config FILE, in TOML"),
         ("locate a b --ba_gpu_index 0", "no GPU is used, so leave it out"),
         ("join --input_path1 a --input_path2 b", "here paths go by their place, without a flag"),
@@ -217,6 +218,7 @@ def test_help_lists_commands_in_groups_the_most_used_first():
 
 def test_the_usage_line_shows_what_is_needed():
     assert run("locate", "-h").stdout.splitlines()[0].endswith(" locate [OPTIONS] MODEL OUT")
+    assert run("evaluate", "-h").stdout.splitlines()[0].endswith(" evaluate [OPTIONS] MODEL [REF]")
     assert re.search(r"^  MODEL ", run("evaluate", "-h").stdout, flags=re.MULTILINE)
     assert run("warm-up", "-h").stdout.splitlines()[0].endswith(" warm-up [OPTIONS]")
 

@@ -95,6 +95,7 @@ def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_pat
             off = [image.projection_center() - positions[image.name] for image in images if image.has_pose]
             # Half a pixel, as far as the placement alone is off; the scene is 20 units across.
             assert len(off) == 4
+            assert model.gauge.statement.endswith("origin and axes: theirs")  # there are none of an input
             assert np.abs(off).max() < 0.05
     assert scales == {True: "unit", False: "prior"}
 

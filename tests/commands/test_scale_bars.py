@@ -269,11 +269,15 @@ def test_a_result_tells_a_length_as_evaluate_does_whether_it_was_adjusted_or_not
         told = found.length(*ends)
         assert told.length == pytest.approx(np.linalg.norm(centers[0] - centers[1]))
         assert str(told).startswith(f"{told.length:.8f} ± "[:6])
-        assert "(95 %)" in str(told)
+        assert " units (95 %)" in str(told)
+        assert str(told).endswith("; the scale is open")
     scaled = sfm_shapefit.map_database(RING / "database.db", scale_bars=written(tmp_path, lines_of(ring)))
     told = scaled.length(*ends)  # of the largest model, with what it knows of its scale
     assert told.has_scale
     assert told == scaled.models[0].length(*ends)
+    assert "open" not in str(told)
+    checked = sfm_shapefit.check(ring, RING / "database.db")
+    assert checked.length(*ends) == sfm_shapefit.evaluate_lengths(ring, [ends]).lengths[0].length
     with pytest.raises(InputError, match="no posed image nobody"):
         plain.length("0001.jpg", "nobody.jpg")
 

@@ -366,7 +366,7 @@ def test_pictures_that_are_missing_or_broken_are_named_and_left_out(tmp_path):
     done = run("workspace", tmp_path / "images", sky.images, tmp_path / "out")
     said = done.stdout + done.stderr
     assert done.exit_code == 0, said
-    assert "warning: 1 image is left out (no picture): 0.png" in said
+    assert "warning: 1 image is left out (not found): 0.png" in said
     assert said.splitlines()[-1].startswith("next: ")
     assert "warning: 1 image is left out (unreadable picture): 1.png" in said
     names = {image.name for image in pycolmap.Reconstruction(tmp_path / "out/sparse/0").images.values()}
@@ -384,9 +384,8 @@ def test_a_broken_picture_prints_no_lines_of_the_library_that_reads_it(tmp_path,
 def test_a_wrong_folder_or_small_pictures_are_refused_and_nothing_is_written(tmp_path):
     sky = draw_sky(tmp_path, ["pinhole"], num_frames=2)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(
-        InputError, match=r"has no picture of the model \(0.png: no picture\); give the folder"
-    ):
+    refused = r"has none of the model's images \(0.png: not found\); give the folder"
+    with pytest.raises(InputError, match=refused):
         sfm_shapefit.workspace(sky.model, tmp_path / "empty", tmp_path / "out")
     for file in sky.images.iterdir():
         cv2.imwrite(str(file), cv2.imread(str(file))[::2, ::2])

@@ -71,6 +71,7 @@ def test_map_starts_from_them_and_tells_where_a_guess_that_is_held_contradicts_t
     assert not found.warnings
     held = sfm_shapefit.map_database(scene[0], intrinsics="held", min_trust=0.0)
     assert any("of camera 2 with 50" in w and "not 768" in w for w in held.warnings)
+    assert any(w.endswith("; intrinsics=auto lets these change") for w in held.warnings)
 
 
 def test_they_outweigh_the_view_graph_where_they_differ_from_it_by_more_than_their_scatter(

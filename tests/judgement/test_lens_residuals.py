@@ -1,13 +1,16 @@
 """Residuals per lens: a pattern is told by a test of chance, and whose it is by its direction."""
 
+import itertools
+
 import numpy as np
 import pycolmap
 import pytest
 
-from sfm_shapefit import check
+from sfm_shapefit import check, evaluate, map_database
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import structure_of
 from sfm_shapefit.judgement.lens_residuals import lens_fields
+from sfm_shapefit.judgement.reasons import Grade
 from tests.lens_scene import camera_of_model, write_scene
 from tests.report.test_report_page import data_of, unpacked
 
@@ -126,3 +129,39 @@ def test_a_focal_length_far_from_the_calibration_of_the_database_is_to_be_looked
         assert (
             any("a focal length 1.50 times the one that was known" in one.sentence for one in found) == said
         )
+
+
+def wall(folder, bend):
+    """Write two rows of eight pictures of a wall, through a lens that the database has without its bend."""
+    rng, ahead = np.random.default_rng(3), np.diag([1.0, -1.0, -1.0])
+    points, poses = rng.uniform([-4.0, -4.0, -0.2], [11.0, 5.0, 0.2], (400, 3)), []
+    for place in itertools.product(range(8), (0.0, 1.2), (4.0,)):
+        turn = pycolmap.Rotation3d(rng.normal(0.0, 0.05, 3)).matrix() @ ahead
+        poses.append(pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ (place + rng.normal(0.0, 0.1, 3))))
+    camera = camera_of_model("SIMPLE_RADIAL")
+    camera.params = [400.0, 320.0, 240.0, bend]
+    write_scene(folder, [camera], poses=poses, points=points)
+    with pycolmap.Database.open(folder / "database.db") as database:
+        camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_PINHOLE, [400.0, 320.0, 240.0]
+        database.update_camera(camera)
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.1])
+def test_a_distortion_that_poses_have_taken_in_is_found_with_how_far_cameras_move_by_it(tmp_path, bend):
+    wall(tmp_path, bend)
+    (found,) = map_database(tmp_path / "database.db").models
+    found.write(tmp_path / "mapped")
+    true = pycolmap.Reconstruction(tmp_path / "sparse/0")
+    centers = np.array([image.projection_center() for image in true.images.values()])
+    radius = np.median(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))
+    errors = evaluate(found, true).position
+    assert (errors.median > 0.02 * radius) == bool(bend)
+    for judged in (found, check(tmp_path / "mapped", second_opinion=False)):
+        if not bend:
+            assert judged.verdict.grade is Grade.GOOD
+            continue
+        (reason,) = judged.verdict.findings
+        assert judged.verdict.grade is Grade.LOOK
+        assert len(reason.images) == 16
+        share = float(reason.sentence.split("cameras move by ")[1].split(" %")[0]) / 100.0
+        assert errors.median < share * radius < errors.max  # by all but one camera in twenty

@@ -82,6 +82,9 @@ def test_columns_survive_the_way_into_the_page_by_trust_and_contradicting_pairs_
     count = int(np.sum(verdicts == PairClass.CONTRADICTS))
     assert (verdicts[:count] == PairClass.CONTRADICTS).all()
     assert (np.diff(residuals[:count]) <= 0).all()
+    kinds = list(dict.fromkeys(PairClass(kind) for kind in verdicts.tolist()))
+    ranked = [PairClass.CONTRADICTS, PairClass.REJECTED, PairClass.UNDETERMINED, PairClass.AGREES]
+    assert kinds == [kind for kind in (*ranked, PairClass.NO_DIRECTION) if kind in kinds]
 
 
 def test_the_page_is_small_and_the_same_for_the_same_scene():
@@ -136,7 +139,9 @@ def test_the_words_say_what_is_placed_and_what_to_look_at():
     text = " ".join(summary_sentences(drawing, facts))
     assert text.startswith("Of 120 pairs, 95 agree with the placed cameras and 18 contradict them; ")
     assert "The least certain position is that of " in text
-    assert "Uncertainties cover noise, rotations, calibration, relative to the model's mean position." in text
+    assert (
+        "Uncertainties cover noise, rotations and calibration, relative to the model's mean position." in text
+    )
     assert text.endswith("Units and axes: scale and origin of the input's centers.")
     assert "ShapeFit's optimum is certified to 3.0e-09" in " ".join(facts.expert_sentences())
     looks = first_looks(drawing, facts)
@@ -433,7 +438,7 @@ def test_pairs_whose_matches_contradict_the_rotations_are_rejected_and_no_gray_p
         "matches contradict the rotations; 1 has no usable direction."
     )
     data = page_data(drawing, facts)
-    assert unpacked(data["pairs"]["verdict"]).tolist() == [0, 4, 3]
+    assert unpacked(data["pairs"]["verdict"]).tolist() == [4, 0, 3]
     colors = "Blue agrees, violet is rejected, gray has no direction."
     assert (
         data["notes"]["matrix"]

@@ -22,7 +22,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.paths import PICTURES, TAKE_FRAMES, VIDEOS, refuse_no_folder
 from sfm_shapefit.base.record import write_json
-from sfm_shapefit.base.settings import flat_values
+from sfm_shapefit.base.settings import flat_values, hint
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.files.colmap.bitmaps import earth_position, read_bitmap
 from sfm_shapefit.files.colmap.intrinsics import fisheye_guess
@@ -343,7 +343,8 @@ def refuse_lens(options: MatchingOptions) -> None:
     """
     known = sorted(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
     if options.camera_model not in known:
-        raise InputError(f"{options.camera_model} is no camera model of COLMAP; there are {', '.join(known)}")
+        meant = hint(options.camera_model.upper(), known)
+        raise InputError(f"{options.camera_model} is no camera model of COLMAP; {meant}")
     if options.camera_params:
         camera = pycolmap.Camera.create_from_model_name(0, options.camera_model, 1.0, 2, 2)
         _numbers(options.camera_params, len(camera.params))
