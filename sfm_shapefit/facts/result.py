@@ -168,7 +168,7 @@ class LocateResult(_Placed):
 
     _PUBLIC = (
         *("reconstruction", "cameras", "pairs", "table", "warnings", "database", "options", "timings_s"),
-        *("gauge", "intrinsics", "rigs", "control_points", "scale_bars", "certified", "adjustment"),
+        *("gauge", "intrinsics", "rigs", "control_points", "scale_bars", "certified"),
     )
     seed: ModelInArrays
     """The output, as `reconstruction` and `write` have it."""

@@ -21,6 +21,7 @@ from sfm_shapefit.judgement.reasons import Kind, ModelVerdict, Reason
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from sfm_shapefit.report.results import draw_checked
+from sfm_shapefit.scene.structure import Structure
 from tests.facts.test_schema import problems
 from tests.judgement.made import opinion_with, place_of
 from tests.program import run, run_refused
@@ -32,7 +33,7 @@ def test_quality_is_that_of_the_models_own_observations():
     model = read_model(RING / "sparse" / "0")
     reconstruction, images = model.reconstruction, model.images
     pictures = pictures_of(reconstruction, images)
-    quality = image_quality(points_of(model.arrays, images), images, pictures)
+    quality = image_quality(Structure(points_of(model.arrays, images), images, pictures))
     mean = np.sum(quality.num_points * quality.errors_px) / quality.num_points.sum()
     assert mean == pytest.approx(reconstruction.compute_mean_reprojection_error(), rel=0.05)  # by point there
     image = reconstruction.image(int(model.images.ids[3]))

@@ -347,12 +347,6 @@ def test_matches_that_only_two_images_share_are_left_out_unless_asked_for_or_no_
     assert triangulated(*seeded(ring_model()[0], batches=[])).num_points3D() == 0
 
 
-def test_matches_of_other_keypoints_are_refused():
-    original, _ = ring_model()
-    with pytest.raises(InputError, match=r"view0\.jpg and view3\.jpg has matches of keypoints"):
-        seeded(original, batches=[batch_of(np.array([[0, 3]]), 121)])
-
-
 def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_shares():
     # every point of the source is split in two of 4 images each, which matches of all images join again
     original, _ = ring_model()

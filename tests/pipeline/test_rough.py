@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
+from sfm_shapefit.base.paths import from_here
 from sfm_shapefit.commands.convert import convert
 from sfm_shapefit.facts.warnings import rotation_warnings, wrong_rotations
 from tests.models import posed
@@ -93,7 +94,7 @@ def test_poses_of_another_scene_are_doubted(tmp_path):
     found = sfm_shapefit.locate(BUNDLED / "ring8/sparse/0", DATABASE, rotations=2.0, min_trust=0.0)
     assert found.verdict.grade != "good"
     assert "is this the model's database?" in found.verdict.statement
-    command = f"sfm-shapefit locate {BUNDLED}/ring8/sparse/0 {{out}} --overwrite"
+    command = f"sfm-shapefit locate {from_here(str(BUNDLED))}/ring8/sparse/0 {{out}} --overwrite"
     assert found.facts.next_step.command == f"{command} --database ITS_DATABASE --rotations 2"
 
 
