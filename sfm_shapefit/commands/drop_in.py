@@ -11,7 +11,7 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.paths import OF_DATABASE
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.commands.map import map_database, measure_run
+from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.commands.write import WriteOptions, deliver
 from sfm_shapefit.facts.command_options import MapOptions
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
@@ -19,6 +19,7 @@ from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pipeline.components import start_run
 from sfm_shapefit.pipeline.execution import workers_of
+from sfm_shapefit.pipeline.mapping import measure_run
 from sfm_shapefit.scene.points import number_points
 
 if TYPE_CHECKING:

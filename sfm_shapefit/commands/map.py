@@ -20,20 +20,14 @@ from sfm_shapefit.files.colmap.database_pairs import explain_no_pairs
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.components import MapContext, start_run
+from sfm_shapefit.pipeline.components import start_run
 from sfm_shapefit.pipeline.execution import workers_of
-from sfm_shapefit.pipeline.mapping import follow_turns, join_mapped, locate_components, refine_intrinsics
-from sfm_shapefit.rotations.sequences import Loop, Videos
+from sfm_shapefit.pipeline.mapping import make_models
+from sfm_shapefit.pipeline.model_joins import join_mapped
 from sfm_shapefit.scene.given import Known
-from sfm_shapefit.scene.lens import FOCAL
 
 if TYPE_CHECKING:
     from distributed import Client
-
-_MANY_DOUBTED = 0.25
-"""Share of images with doubtful intrinsics from which relative rotations are measured twice; fewer are found
-with the poses, which the others hold, and their pairs do not decide the averaging."""
-_UNMATCHED = f"no matches: fewer than {LEAST_MATCHES} inliers with every other image"
 
 
 def map_database(
@@ -79,11 +73,8 @@ def map_opened(
     file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | Known | None = None
 ) -> MapResult:
     """Do what `map_database` does, with a database that is open."""
-    run = start_run(file, options, clock, priors)
+    run, relative, videos, models, reasons = make_models(start_run(file, options, clock, priors))
     path = file.path
-    run, relative, videos, loops = measure_run(run)
-    reasons = dict.fromkeys(range(int(run.frame_of_image.max()) + 1), _UNMATCHED)
-    models = locate_components(run, relative, loops, reasons)
     if not models:
         raise UnsolvableError(_explain_failure(file, relative, reasons))
     with clock("join") if options.join == "safe" else nullcontext():
@@ -114,23 +105,6 @@ def map_opened(
         ),
     )
     return tell_joins(result)
-
-
-def measure_run(run: MapContext) -> tuple[MapContext, RelativeRotations, Videos, tuple[Loop, ...]]:
-    """Return the relative rotations of all pairs that are believed, videos, and their loops.
-
-    The run knows scores of the pairs then, and which ones are refused.
-    """
-    relative = run.measure()
-    doubted = run.intrinsics.parts[run.images.lens_of, FOCAL]
-    if run.options.freedom.adjust != "none" and doubted.mean() >= _MANY_DOUBTED:
-        known = refine_intrinsics(run, relative)
-        if known.differ_in_rays(run.images):
-            run = run._replace(images=known)
-            relative = run.measure()
-    run, videos = follow_turns(run, relative), run.find_videos(relative)
-    run, relative, loops = run.judge_loops(videos, relative)
-    return run.score_pairs(relative), relative, videos, loops
 
 
 def _explain_failure(file: DatabaseFile, relative: RelativeRotations, reasons: dict[int, str]) -> str:

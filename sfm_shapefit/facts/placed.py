@@ -46,6 +46,8 @@ METERS = "m"
 SOLVER_UNITS = "in the solver's units"
 NOISE_ONLY = "matching noise only"
 """Beginning of a statement that standard deviations leave out errors of rotations and calibration."""
+BY_PRIORS = "the position priors"
+"""End of a statement that standard deviations include errors of scale and origin."""
 IN_MEMORY = "in memory"
 """Stand-in for the path of a model without one, in locate.json."""
 SCHEMA_VERSION: Literal[1] = 1  # number in each JSON output; within it keys are added, never renamed
@@ -145,6 +147,8 @@ def unit_of(gauge: Gauge) -> str:
 
 def relation_of(sigma_of: str) -> str:
     """Say what standard deviations are relative to, in few words."""
+    if sigma_of.endswith(BY_PRIORS):
+        return f"relative to {BY_PRIORS}"
     return f"relative to {'the fixed cameras' if 'fixed cameras' in sigma_of else 'one another'}"
 
 
@@ -357,12 +361,16 @@ def facts_of_placement(
     }
 
 
-def sigma_of(placement: Judged) -> str:
-    """Say what the standard deviations of the cameras know of, and what they are relative to."""
+def sigma_of(placement: Judged, *, by_priors: bool = False) -> str:
+    """Say what the standard deviations of the cameras know of, and what they are relative to.
+
+    Priors that pulled the cameras leave no similarity open.
+    """
     if placement.adjusted_covariances is None:
         return f"{NOISE_ONLY}; relative to the centroid and scale of the cameras that are held"
     held = ~placement.adjusted_covariances.any(axis=(1, 2))
     relative = f"{int(held.sum())} fixed cameras" if held.any() else "the model's mean position and scale"
+    relative = BY_PRIORS if by_priors else relative
     return f"adjusted: noise, rotations, calibration; relative to {relative}"
 
 

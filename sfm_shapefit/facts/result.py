@@ -33,6 +33,7 @@ from sfm_shapefit.facts.placed import (
     GraphFacts,
     GraphInputs,
     facts_of_placement,
+    sigma_of,
     unit_of,
 )
 from sfm_shapefit.facts.placed_graph import PlacedGraph
@@ -55,6 +56,7 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.gauge_options import KnownDistance
 from sfm_shapefit.placement.prior_fit import PriorFit
+from sfm_shapefit.placement.prior_refinement import PULLED
 from sfm_shapefit.placement.right_pairs import TakenForRight, examine_right_pairs
 from sfm_shapefit.refinement.placement_options import PlacementOptions
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -262,6 +264,7 @@ class LocateResult(_Placed):
             "num_images": len(self.image_names),
             "num_placed": model.num_reg_images(),
             "num_pairs": len(self.directions.pairs),
+            "sigma_of": sigma_of(placement, by_priors=PULLED in gauge.statement),
         }
         facts["num_pairs_rejected"] += len(self.directions.pairs) - placement.num_pairs
         return ModelFacts.taken_from(

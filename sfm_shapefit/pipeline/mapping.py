@@ -1,40 +1,95 @@
-"""`map` from averaged rotations to models: one of each component, and those that belong together joined."""
+"""`map` from matches to models, one of each component, with lenses of the view graph or the database."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.clock import Clock
-from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.settings import flat_values
-from sfm_shapefit.facts.joined_cameras import JoinInputs
-from sfm_shapefit.facts.joins import JoinFacts
-from sfm_shapefit.facts.map_result import JoinedModel
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.judgement.reasons import Kind, Reason, of_model
 from sfm_shapefit.judgement.rig_offsets import turn_sensors
+from sfm_shapefit.pairs.direction_options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import MapContext
-from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs, see_matches
-from sfm_shapefit.pipeline.model_joins import judge_joins, merge_groups, tell_group
-from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
-from sfm_shapefit.pipeline.remedies import at_one_center, make_model
+from sfm_shapefit.pipeline.inputs import MatchSource, RunInputs
+from sfm_shapefit.pipeline.remedies import at_one_center, has_better_models, make_model, with_database_lenses
 from sfm_shapefit.pipeline.starts import adjust_first_placement
 from sfm_shapefit.pipeline.state import ModelState
 from sfm_shapefit.placement.place import ContradictedOffsetsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.components import pairs_among
-from sfm_shapefit.rotations.sequences import Loop
-from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.rotations.sequences import Loop, Videos
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import FOCAL
 from sfm_shapefit.scene.matches import PairNames
+
+_MANY_DOUBTED = 0.25
+"""Share of images with doubtful intrinsics from which relative rotations are measured twice; fewer are found
+with the poses, which the others hold, and their pairs do not decide the averaging."""
+_UNMATCHED = f"no matches: fewer than {LEAST_MATCHES} inliers with every other image"
+
+
+class Attempt(NamedTuple):
+    """What is made from one choice of focal lengths: models, and why frames belong to none."""
+
+    run: MapContext
+    relative: RelativeRotations
+    videos: Videos
+    models: list[LocateResult]
+    reasons: dict[int, str]
+
+
+def make_models(run: MapContext) -> Attempt:
+    """Return the models of a run, by the focal lengths of the database if those of the view graph fail."""
+    first, old = _make_models(run), run.images.lenses
+    new = with_database_lenses(old, run.intrinsics, first.models)
+    if new is None:
+        return first
+    changed = [k for k in range(len(old)) if old[k] != new[k]]
+    by_view_graph = run.intrinsics.by_view_graph & ~np.isin(np.arange(len(old)), changed)
+    intrinsics = replace(run.intrinsics, by_view_graph=by_view_graph)
+    again = _make_models(run._replace(images=run.images.with_lenses(new), intrinsics=intrinsics))
+    if not has_better_models(again.models, first.models):
+        return first
+    focals = [
+        f"camera {new[k].id} with {new[k].focal_px:,.0f} px, not {old[k].focal_px:,.0f}" for k in changed
+    ]
+    run.matches.file.notes.append(
+        "images contradict what the focal lengths of the view graph lead to, so all was done again from the "
+        f"database's: {first_of(focals)}"
+    )
+    return again
+
+
+def _make_models(run: MapContext) -> Attempt:
+    run, relative, videos, loops = measure_run(run)
+    reasons = dict.fromkeys(range(int(run.frame_of_image.max()) + 1), _UNMATCHED)
+    return Attempt(run, relative, videos, locate_components(run, relative, loops, reasons), reasons)
+
+
+def measure_run(run: MapContext) -> tuple[MapContext, RelativeRotations, Videos, tuple[Loop, ...]]:
+    """Return the relative rotations of all pairs that are believed, videos, and their loops.
+
+    The run knows scores of the pairs then, and which ones are refused.
+    """
+    relative = run.measure()
+    doubted = run.intrinsics.parts[run.images.lens_of, FOCAL]
+    if run.options.freedom.adjust != "none" and doubted.mean() >= _MANY_DOUBTED:
+        known = refine_intrinsics(run, relative)
+        if known.differ_in_rays(run.images):
+            run = run._replace(images=known)
+            relative = run.measure()
+    run, videos = follow_turns(run, relative), run.find_videos(relative)
+    run, relative, loops = run.judge_loops(videos, relative)
+    return run.score_pairs(relative), relative, videos, loops
 
 
 def refine_intrinsics(run: MapContext, relative: RelativeRotations) -> Images:
@@ -169,60 +224,3 @@ def _suspicions(run: MapContext, averaging: AveragedRotations) -> Iterator[Reaso
         yield of_model(Kind.REPEATED, clause)
     if averaging.num_rivals:
         yield of_model(Kind.REPEATED, "the images can be arranged in another way")
-
-
-def join_mapped(
-    models: Sequence[LocateResult], run: MapContext
-) -> tuple[tuple[JoinFacts, ...], tuple[JoinedModel, ...], tuple[str, ...]]:
-    """Join the models of a run, largest first, where that is safe and wanted.
-
-    Returns:
-        What came of joining each model but the largest, the models in one world, larger ones first, and what
-        was told and could not be used for it, a sentence each.
-    """
-    if len(models) < 2 or run.options.join == "never":
-        return (), (), ()
-    located = dict(enumerate(models))
-    pieces = [
-        ModelPiece(
-            label=f"model {number}",
-            model=read_model(one.model.arrays()),
-            scale_sigma=(one.gauge.scale_sigma or 0.0) if one.images.has_rigs else None,
-        )
-        for number, one in located.items()
-    ]
-    warnings: list[str] = []
-    priors = list(_priors_of(pieces, run, warnings))
-    tied = tie_pieces(pieces, run.matches, run.without)
-    joins = list(judge_joins(pieces, tied, priors))
-    options, inputs = run.options, run.inputs
-    join_inputs = JoinInputs(
-        joins, flat_values(options), inputs, options.gauge.known_distance, located=located
-    )
-    joined = []
-    for group in merge_groups(pieces, tied, joins):
-        images = read_model(group.reconstruction).images
-        rows = np.searchsorted(run.images.names, images.names)
-        told = join_inputs._replace(bars=run.known.bars and run.known.bars.of(rows))
-        source = see_matches(run.matches, images, inputs)
-        joined.append(tell_group(group, told, source, options.directions, run.clock.anew()))
-    return tuple(joins), tuple(joined), tuple(warnings)
-
-
-def _priors_of(
-    pieces: Sequence[ModelPiece], run: MapContext, warnings: list[str]
-) -> Iterator[PositionPriors | None]:
-    """Yield the position priors of the images of each piece, told or those of the database."""
-    priors = run.known.priors
-    if priors is None:
-        try:
-            priors = database_priors(run.matches.file, run.images)
-        except MissingPriorsError:
-            pass
-        except InputError as error:
-            warnings.append(f"the position priors of the database join no models: {error}")
-    for piece in pieces:
-        piece_priors = (
-            None if priors is None else priors.of(np.searchsorted(run.images.names, piece.model.images.names))
-        )
-        yield piece_priors if piece_priors else None

@@ -7,7 +7,7 @@ Nothing is placed anew. What the models know of their own cameras is kept, see `
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,16 +17,20 @@ from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import UNMOVED, Similarity, angle_between, compose, median_spread
+from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.joined_cameras import JoinedGroup, JoinInputs, tell_joined
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.map_result import JoinedModel
+from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.scale_bars import compare_bars
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.files.colmap.reconstructions import transform_model
 from sfm_shapefit.pairs.direction_options import DirectionOptions
-from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces
+from sfm_shapefit.pipeline.components import MapContext
+from sfm_shapefit.pipeline.inputs import MatchSource, see_matches
+from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces, tie_pieces
 from sfm_shapefit.pipeline.referee import check_source
 from sfm_shapefit.placement.gauge import ARBITRARY, Gauge
 from sfm_shapefit.placement.gauge_rule import gauge_of_distances, resized_gauge
@@ -88,7 +92,7 @@ class _Growing:
     def __init__(self, piece: ModelPiece, number: int) -> None:
         reconstruction = piece.model.reconstruction
         self.group = JoinedGroup(reconstruction, {number: UNMOVED}, ())
-        self.ids: dict[int, Mapping[int, int]] = {number: {i: i for i in reconstruction.point3D_ids()}}
+        self.ids: dict[int, dict[int, int]] = {number: {i: i for i in reconstruction.point3D_ids()}}
         """New ids of each piece's points, by the old ones."""
 
     def add(self, done: JoinFacts, piece: ModelPiece, tied: TiedPieces) -> None:
@@ -107,7 +111,7 @@ class _Growing:
         self.group = JoinedGroup(merged, worlds, (*self.group.joins, done), known)
 
     def _same_points(
-        self, join: PieceJoin, worlds: Mapping[int, Similarity], tied: TiedPieces
+        self, join: PieceJoin, worlds: dict[int, Similarity], tied: TiedPieces
     ) -> list[tuple[int, int]]:
         """Return points of the group and of a new piece that are one by the pairs that agree; each once."""
         pieces = tied.cameras.piece_of[tied.ties.matches.pairs]
@@ -125,7 +129,7 @@ class _Growing:
         return [(one, other) for other, one in same.items()]
 
 
-def _fitting(tied: TiedPieces, pair: int, worlds: Mapping[int, Similarity]) -> tuple[slice, BoolArray]:
+def _fitting(tied: TiedPieces, pair: int, worlds: dict[int, Similarity]) -> tuple[slice, BoolArray]:
     """Return the matches of a pair, and which of them see, from each side, the point of the other side."""
     ties = tied.ties.matches
     rows = ties.slice_of(pair)
@@ -186,3 +190,60 @@ def _moved(group: JoinedGroup, motion: Similarity) -> JoinedGroup:
         reconstruction=transform_model(group.reconstruction, motion),
         world_from={number: compose(motion, one) for number, one in group.world_from.items()},
     )
+
+
+def join_mapped(
+    models: Sequence[LocateResult], run: MapContext
+) -> tuple[tuple[JoinFacts, ...], tuple[JoinedModel, ...], tuple[str, ...]]:
+    """Join the models of a run, largest first, where that is safe and wanted.
+
+    Returns:
+        What came of joining each model but the largest, the models in one world, larger ones first, and what
+        was told and could not be used for it, a sentence each.
+    """
+    if len(models) < 2 or run.options.join == "never":
+        return (), (), ()
+    located = dict(enumerate(models))
+    pieces = [
+        ModelPiece(
+            label=f"model {number}",
+            model=read_model(one.model.arrays()),
+            scale_sigma=(one.gauge.scale_sigma or 0.0) if one.images.has_rigs else None,
+        )
+        for number, one in located.items()
+    ]
+    warnings: list[str] = []
+    priors = list(_priors_of(pieces, run, warnings))
+    tied = tie_pieces(pieces, run.matches, run.without)
+    joins = list(judge_joins(pieces, tied, priors))
+    options, inputs = run.options, run.inputs
+    join_inputs = JoinInputs(
+        joins, flat_values(options), inputs, options.gauge.known_distance, located=located
+    )
+    joined = []
+    for group in merge_groups(pieces, tied, joins):
+        images = read_model(group.reconstruction).images
+        rows = np.searchsorted(run.images.names, images.names)
+        told = join_inputs._replace(bars=run.known.bars and run.known.bars.of(rows))
+        source = see_matches(run.matches, images, inputs)
+        joined.append(tell_group(group, told, source, options.directions, run.clock.anew()))
+    return tuple(joins), tuple(joined), tuple(warnings)
+
+
+def _priors_of(
+    pieces: Sequence[ModelPiece], run: MapContext, warnings: list[str]
+) -> Iterator[PositionPriors | None]:
+    """Yield the position priors of the images of each piece, told or those of the database."""
+    priors = run.known.priors
+    if priors is None:
+        try:
+            priors = database_priors(run.matches.file, run.images)
+        except MissingPriorsError:
+            pass
+        except InputError as error:
+            warnings.append(f"the position priors of the database join no models: {error}")
+    for piece in pieces:
+        piece_priors = (
+            None if priors is None else priors.of(np.searchsorted(run.images.names, piece.model.images.names))
+        )
+        yield piece_priors if piece_priors else None

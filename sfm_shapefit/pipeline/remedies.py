@@ -6,7 +6,7 @@ whose offsets in their rigs are contradicted go where matches inside frames put 
 short to tell the scale, the sensors are taken to share one center.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -17,10 +17,10 @@ from sfm_shapefit.adjustment.free_sensors import OpenSensorError
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.clock import Clock
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.facts.intrinsics import describe_intrinsics
+from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, describe_intrinsics
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.judgement.limits import OUTNUMBERED
-from sfm_shapefit.judgement.reasons import Kind, of_model
+from sfm_shapefit.judgement.reasons import Grade, Kind, of_model
 from sfm_shapefit.judgement.rig_offsets import find_contradicted_rigs, measured_offsets
 from sfm_shapefit.judgement.wrong_lenses import is_like_others
 from sfm_shapefit.pipeline.conventions import ask_resolution
@@ -32,7 +32,7 @@ from sfm_shapefit.pipeline.starts import begin_model
 from sfm_shapefit.placement.gauge import UselessPriorsError
 from sfm_shapefit.placement.place import ContradictedOffsetsError
 from sfm_shapefit.scene.freedom import RigFreedom
-from sfm_shapefit.scene.lens import FOCAL, Origin
+from sfm_shapefit.scene.lens import FOCAL, Lens, Origin
 
 _OPEN_SCALE = 0.5  # relative standard deviation; with a larger one the offsets may as well be 0
 _SHORT = 2e-3  # baselines; an offset as short turns a direction by a tenth of a degree, as its errors do
@@ -239,3 +239,31 @@ def _count(result: LocateResult) -> int:
     evidence, left_out = result.evidence, int(np.sum(~result.kept))
     apart = sum(map(len, evidence.apart))
     return len(evidence.lenses) + left_out + len(evidence.places) + apart
+
+
+def with_database_lenses(
+    lenses: Sequence[Lens], intrinsics: RefinedIntrinsics, models: Sequence[LocateResult]
+) -> list[Lens] | None:
+    """Return lenses as they were given in place of those of the view graph, if models speak against one.
+
+    Fundamental matrices of images whose optical axes meet, as of two lenses side by side, hardly tell focal
+    lengths, so that the view graph may be off by a factor of two, and with it relative rotations, averaging
+    and placement. A model that is good, whatever its images ask for, says nothing against it.
+    """
+    grade, named = models[0].verdict.grade if models else Grade.DO_NOT_USE, {lens.id for lens in lenses}
+    if grade is not Grade.DO_NOT_USE:
+        named = {lens.camera for lens in models[0].evidence.lenses if grade is not Grade.GOOD}
+    doubted = [found and lens.is_plane for found, lens in zip(intrinsics.by_view_graph, lenses, strict=True)]
+    if not any(doubt and lens.id in named for doubt, lens in zip(doubted, lenses, strict=True)):
+        return None
+    return [lens.as_given() if doubt else lens for doubt, lens in zip(doubted, lenses, strict=True)]
+
+
+def has_better_models(models: Sequence[LocateResult], others: Sequence[LocateResult]) -> bool:
+    """Return whether less speaks against the largest model, with lenses known and no camera lost."""
+    if not (models and others):
+        return bool(models)
+    own, before = models[0], others[0]
+    ranks = [(list(Grade).index(one.verdict.grade), _count(one)) for one in (own, before)]
+    known = not own.intrinsics.undetermined.any()
+    return bool(ranks[0] < ranks[1] and known and own.kept.sum() >= before.kept.sum())

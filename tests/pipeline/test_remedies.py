@@ -56,6 +56,27 @@ def test_map_frees_a_lens_too(truth, tmp_path):
     assert model.verdict.grade is Grade.GOOD
 
 
+def test_map_starts_again_from_the_guess_where_the_view_graph_is_wrong(tmp_path):
+    """Its fundamental matrices are those of a lens twice as long, which nothing else agrees with."""
+    path = tmp_path / "database.db"
+    path.write_bytes(DATABASE.read_bytes())
+    to_true = np.array([[0.5, 0.0, 300.0], [0.0, 0.5, 225.0], [0.0, 0.0, 1.0]])
+    with closing(sqlite3.connect(path)) as database, database:
+        guess = np.array([850.0, 850.0, 600.0, 450.0]).tobytes()
+        database.execute("UPDATE cameras SET params = ?, prior_focal_length = 0", (guess,))
+        for pair, matrix in database.execute("SELECT pair_id, F FROM two_view_geometries").fetchall():
+            longer = to_true.T @ np.frombuffer(matrix).reshape(3, 3) @ to_true
+            row = longer.tobytes(), pair
+            database.execute("UPDATE two_view_geometries SET F = ? WHERE pair_id = ?", row)
+    found = sfm_shapefit.map_database(path, points="never")
+    (model,) = found.models
+    assert [warning.split("database's: ")[-1] for warning in found.warnings] == [
+        "camera 1 with 850 px, not 2,000"
+    ]
+    assert model.reconstruction.camera(1).mean_focal_length() == pytest.approx(1000.0, rel=1e-3)
+    assert (model.verdict.grade, found.num_placed) == (Grade.GOOD, 8)
+
+
 def test_a_lens_whose_image_is_left_out_is_found_too():
     """Its rotation is not believed, so that it makes no points."""
     truth = pycolmap.Reconstruction(COURTYARD / "truth")

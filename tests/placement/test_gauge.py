@@ -564,6 +564,8 @@ def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
     table.write_text("\n".join(f"{line} {sigma}" for line in table.read_text().splitlines()))
     facts = json.loads(run(*arguments, tmp_path / "out").stdout)
     assert "; the priors moved cameras by " in facts["scale"]
+    assert facts["sigma_of"].endswith("relative to the position priors")
+    assert not plain["sigma_of"].endswith("priors")
     run(*arguments, tmp_path / "full", "--adjust", "full")
     off = []
     for folder in ("plain", "out", "full"):
