@@ -62,6 +62,8 @@ def find_missing_distortion(
     bends = Freedom(parts=np.stack([is_bent, is_bent], axis=1), pull_rad=0.0 if rotations_held else np.inf)
     run = replace(begin(images, tracks[0], StructureOptions(), bends, crew=Crew(threads)), links=None)
     problem = run.problem(*tracks)
+    if np.isnan(reprojection_errors_px(problem)).all():  # all points lie behind the cameras
+        return nobody
     run = replace(run, freedom=replace(bends, noise_px=noise_px_of(problem)))
     try:
         if _move(problem, run.solve(problem, _FALL, settles_points=True)[1]) <= _LARGE:
