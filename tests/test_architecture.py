@@ -12,7 +12,7 @@ from tests.program import run_python
 MOST_ARROWS = 91  # between rooms, beside those to base/; the list may only become shorter
 
 # Lines of the package, docstrings and blank ones counted; who raises it says in the commit what they buy.
-MOST_LINES = 67_200
+MOST_LINES = 67_500
 MOST_LINES_OF_A_PAGE = 150  # of the pipeline of a command, so that its stages are seen at one glance
 MOST_STAGES, MOST_FLOORS_OF_STAGES = 24, 7  # of pipeline/; what users call is a page of commands/
 MOST_IMPORTED = 46  # names of a page or stage; one that does several things is to be split by these
