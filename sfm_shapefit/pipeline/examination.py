@@ -133,7 +133,8 @@ def with_known_lenses(
 ) -> ModelEvidence:
     """Return the evidence with lenses that miss a distortion, and focal lengths far from those known.
 
-    These were given, or a database has them. Where the shape is held, no distortion is asked for.
+    These were given, or a database has them. Where the shape is held, no distortion is asked for; images that
+    are odd already have no part in it, as their errors would be taken for one.
     """
     images, matches, among = structure.images, source.matches, structure.among
     if among is not None:
@@ -143,6 +144,8 @@ def with_known_lenses(
     known_px |= {k: one.as_given().focal_px for k, one in lenses if one.origin is Origin.CALIBRATION}
     odd = [*evidence.odd, *find_changed_lenses(images, known_px)]
     if not shape_held:
+        if (doubted := structure.images.are_named([name for one in odd for name in one.images])).any():
+            structure = replace(structure, among=~doubted if among is None else among & ~doubted)
         bent, share = find_missing_distortion(structure, rotations_held=rotations_held, threads=threads)
         if len(bent):
             shares, names = np.full(len(bent), 100.0 * share), structure.images.names_of(bent)
