@@ -23,7 +23,7 @@ from sfm_shapefit.adjustment.run import MOST_FRAMES, begin
 from sfm_shapefit.adjustment.shared_errors import group_neighbors
 from sfm_shapefit.adjustment.solve import reprojection_errors_px
 from sfm_shapefit.adjustment.views import views_of
-from sfm_shapefit.base.arrays import IntArray, quantile
+from sfm_shapefit.base.arrays import BoolArray, IntArray, quantile
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.executors import Crew
 from sfm_shapefit.base.geometry import fit_similarity_l1
@@ -42,15 +42,15 @@ _SIGMAS, _FALL = 3.0, 1e-4  # see the header; relative fall of the cost, as in a
 
 
 def find_missing_distortion(
-    structure: Structure, *, rotations_held: bool = False, threads: int = 0
+    structure: Structure, asked: BoolArray, *, rotations_held: bool = False, threads: int = 0
 ) -> tuple[IntArray, float]:
     """Return the images whose lenses miss a distortion, and the share that cameras move by; see the header.
 
-    There are none with lenses that no adjustment knows, nor with more frames than are worth the time.
+    Only posed images that are `asked` (i,) have a part in it. There are none with lenses that no adjustment
+    knows, nor with more frames than are worth the time.
     """
-    images, among = structure.images, structure.among
-    rows = np.flatnonzero(images.is_posed if among is None else images.is_posed & among)
-    images, nobody = images.part(rows), (rows[:0], 0.0)
+    rows = np.flatnonzero(structure.images.is_posed & asked)
+    images, nobody = structure.images.part(rows), (rows[:0], 0.0)
     is_bent = np.array([lens.model in _BENT for lens in images.lenses], dtype=np.bool_)
     are_known = all(lens.is_adjustable for lens in images.lenses)
     if not (is_bent.any() and are_known and 2 < len(images.frames.ids) <= MOST_FRAMES):

@@ -1,4 +1,4 @@
-"""Rows of numbers in a temporary file: what is read from end to end, and would take the most memory."""
+"""Rows that would take the most memory: in a temporary file, in fewer bits, or looked up and not copied."""
 
 import tempfile
 import threading

@@ -104,7 +104,7 @@ def question(state: ModelState, clock: Clock) -> ModelEvidence:
     places = (one.moved(gauge.similarity.scale, gauge.axes) for one in found.places)
     inputs, found = state.inputs, replace(found, places=tuple(places))
     held = {"rotations_held": inputs.knows_rotations, "shape_held": _is_shape_held(state)}
-    return with_known_lenses(found, source, structure, clock.threads, **held)
+    return with_lens_evidence(found, source, structure, clock.threads, **held)
 
 
 def confirm_by_pixels(state: ModelState) -> BoolArray:
@@ -122,7 +122,7 @@ def confirm_by_pixels(state: ModelState) -> BoolArray:
     return images.are_named(ask_pixels(source, Structure(state.points, images, pictures), names))
 
 
-def with_known_lenses(
+def with_lens_evidence(
     evidence: ModelEvidence,
     source: MatchSource,
     structure: Structure,
@@ -144,9 +144,12 @@ def with_known_lenses(
     known_px |= {k: one.as_given().focal_px for k, one in lenses if one.origin is Origin.CALIBRATION}
     odd = [*evidence.odd, *find_changed_lenses(images, known_px)]
     if not shape_held:
-        if (doubted := structure.images.are_named([name for one in odd for name in one.images])).any():
-            structure = replace(structure, among=~doubted if among is None else among & ~doubted)
-        bent, share = find_missing_distortion(structure, rotations_held=rotations_held, threads=threads)
+        asked = ~structure.images.are_named([name for one in odd for name in one.images])
+        if among is not None:
+            asked &= among
+        bent, share = find_missing_distortion(
+            structure, asked, rotations_held=rotations_held, threads=threads
+        )
         if len(bent):
             shares, names = np.full(len(bent), 100.0 * share), structure.images.names_of(bent)
             odd.append(OddImages.of_values(Kind.LENS, names, shares, _MISSES_DISTORTION))

@@ -40,7 +40,7 @@ from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.pairs.direction_options import DirectionOptions
 from sfm_shapefit.pipeline.bundle import points_of_pictures
 from sfm_shapefit.pipeline.conventions import ask_convention
-from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence, with_known_lenses
+from sfm_shapefit.pipeline.examination import ask_pixels, ask_shape, gather_evidence, with_lens_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
@@ -116,7 +116,7 @@ def gather_evidence_against(state: CheckState, clock: Clock) -> CheckState:
     """Gather the evidence as `locate` does, with the open shape where nothing else has measured lenses."""
     source, structure = state.source, state.structure
     evidence = gather_evidence(source, state.fits, structure, clock.threads)
-    evidence = with_known_lenses(evidence, source, structure, clock.threads)
+    evidence = with_lens_evidence(evidence, source, structure, clock.threads)
     if source.inputs.is_made or not source.has_database:
         tracks = collect_tracks(state.images, structure.pictures, structure.points)
         rows = np.arange(state.images.num_images)
